@@ -1,0 +1,1 @@
+"""Maps of line segments and circles from 2D range scans, with covariances that can be believed."""

@@ -1,0 +1,60 @@
+"""Angles, directions, and a line seen from another anchor."""
+
+import dataclasses
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from linemap_jax.core.state import Lines
+
+
+def wrap_angle(angle: Float[Array, "*s"]) -> Float[Array, "*s"]:
+    """The same angle in (-pi, pi]. In and out in radians."""
+    return angle - 2 * jnp.pi * jnp.ceil((angle - jnp.pi) / (2 * jnp.pi))
+
+
+def unit(angle: Float[Array, "*s"]) -> Float[Array, "*s 2"]:
+    """Unit vector in the direction of an angle in radians."""
+    return jnp.stack([jnp.cos(angle), jnp.sin(angle)], -1)
+
+
+def perp(vector: Float[Array, "*s 2"]) -> Float[Array, "*s 2"]:
+    """The vector turned by +90 degrees: the derivative of a rotated vector with respect to the angle."""
+    return jnp.stack([-vector[..., 1], vector[..., 0]], -1)
+
+
+def rotate(angle: Float[Array, ""], vector: Float[Array, "2"]) -> Float[Array, "2"]:
+    """The vector turned by an angle in radians."""
+    return vector[0] * unit(angle) + vector[1] * perp(unit(angle))
+
+
+def dot(a: Float[Array, "*s 2"], b: Float[Array, "*s 2"]) -> Float[Array, "*s"]:
+    """Scalar product of plane vectors."""
+    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1]
+
+
+def shift_matrix(lever: Float[Array, "*s"]) -> Float[Array, "*s 2 2"]:
+    """S of (offset', angle)' = S (offset, angle): the same small change of a line, seen from another anchor.
+
+    `lever` is `tangent . (old anchor - new anchor)` in metres. Source: offset' = offset + n(angle) . (old - new), whose
+    derivative with respect to the angle is the lever.
+    """
+    one, zero = jnp.ones_like(lever), jnp.zeros_like(lever)
+    return jnp.stack([jnp.stack([one, lever], -1), jnp.stack([zero, one], -1)], -2)
+
+
+def reanchor(lines: Lines, anchor: Float[Array, "*s 2"]) -> Lines:
+    """The same line relative to another anchor; the mean exactly, the covariance to first order. For one line or many.
+
+    The end points do not move. `anchor` should lie on the segment: far from it the first order fails.
+    """
+    step = lines.anchor - anchor
+    along = dot(lines.tangent, step)
+    shift = shift_matrix(along)
+    return dataclasses.replace(
+        lines,
+        anchor=anchor,
+        offset=lines.offset + dot(lines.normal, step),
+        cov=shift @ lines.cov @ jnp.swapaxes(shift, -1, -2),
+        extent=lines.extent + along[..., None],
+    )

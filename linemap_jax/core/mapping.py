@@ -1,0 +1,364 @@
+"""Sections 5 and 6 as a whole: one scan into the map.
+
+The lines of a scan are taken all at once: matched with the map as it stood, fused, added; then the map is wiped. The
+paper takes them one after the other, which gives nearly the same map and no parallelism.
+"""
+
+import dataclasses
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
+
+from linemap_jax.core import fusion, matching, wiping
+from linemap_jax.core.circles import near_lines
+from linemap_jax.core.extract import as_dtype, extract
+from linemap_jax.core.sensor import Points, points_from_scan
+from linemap_jax.core.settings import (
+    SCAN_CAPACITY,
+    Capacity,
+    Covariance,
+    Jacobians,
+    Mount,
+    Rules,
+    Segmentation,
+    SensorNoise,
+    Thresholds,
+)
+from linemap_jax.core.state import (
+    LEFT_OUT,
+    NEW,
+    Circles,
+    Extraction,
+    LineMap,
+    Lines,
+    Pose,
+    Report,
+    Scan,
+    SlotsT,
+    Status,
+    empty_circles,
+    empty_lines,
+    neutral_where_free,
+)
+
+
+def empty_map(capacity: Capacity = Capacity(), dtype: jnp.dtype | type | None = None) -> LineMap:
+    """A map with free slots only. The dtype is jax's default unless given; it should be that of the scans."""
+    return LineMap(lines=empty_lines(capacity.lines, dtype), circles=empty_circles(capacity.circles, dtype))
+
+
+@partial(jax.jit, static_argnames=("capacity", "rules", "segmentation", "covariance", "jacobians"))
+def update(
+    line_map: LineMap,
+    scan: Scan,
+    pose: Pose,
+    *,
+    thresholds: Thresholds | None = None,
+    noise: SensorNoise | None = None,
+    mount: Mount | None = None,
+    capacity: Capacity = SCAN_CAPACITY,
+    rules: Rules = Rules(),
+    segmentation: Segmentation = "incremental",
+    covariance: Covariance = "exact",
+    jacobians: Jacobians = "autodiff",
+) -> tuple[LineMap, Report]:
+    """Bring one scan into the map: extract, match, fuse or add, merge, wipe.
+
+    A scan without returns, or with a pose that is not finite, changes nothing.
+
+    Args:
+      line_map: the map so far.
+      scan: `N` beams, of the dtype of the map.
+      pose: of the robot.
+      thresholds: `Thresholds()` unless given.
+      noise: of the sensor; `SensorNoise()` unless given.
+      mount: of the scanner on the robot; at its centre, looking ahead, unless given.
+      capacity: slots for the lines and circles of the scan (those of the map are its own).
+      rules: which reading of the method.
+      segmentation: as for `extract`.
+      covariance: as for `extract`.
+      jacobians: as for `extract`.
+
+    Returns:
+      The map, and what the scan did to it. When a capacity is full, what fits is kept and the status tells.
+
+    Raises:
+      ValueError: at trace time, for an option that does not exist or a map of another dtype than the scan.
+    """
+    dtype = scan.ranges.dtype
+    if line_map.lines.cov.dtype != dtype:
+        raise ValueError(f"the map is {line_map.lines.cov.dtype} and the scan {dtype}; make both the same")
+    thresholds, noise, mount, pose = as_dtype(
+        (thresholds or Thresholds(), noise or SensorNoise(), mount or Mount(), pose), dtype
+    )
+    found = extract(
+        scan,
+        pose,
+        thresholds=thresholds,
+        noise=noise,
+        mount=mount,
+        capacity=capacity,
+        rules=rules,
+        segmentation=segmentation,
+        covariance=covariance,
+        jacobians=jacobians,
+    )
+    usable = (found.status & int(Status.POSE_NOT_FINITE)) == 0
+    scan = dataclasses.replace(scan, valid=scan.valid & usable)
+    pose = jax.tree.map(lambda x: jnp.where(usable, x, 0), pose)
+    points = points_from_scan(scan, pose, mount, jacobians=jacobians)
+
+    lines = _update_lines(line_map.lines, found, pose, thresholds, rules)
+    swept = _sweep(line_map.circles, lines, found, points, scan, pose, thresholds, noise, rules)
+    circles = _update_circles(line_map.circles, found, swept.lines, lines.targets, swept.gone, thresholds, rules)
+
+    status = found.status
+    status |= jnp.where(lines.overflow | swept.wiped.overflow, int(Status.MAP_LINES_FULL), 0)
+    status |= jnp.where(circles.overflow, int(Status.MAP_CIRCLES_FULL), 0)
+    report = Report(
+        line_slot=lines.slot,
+        line_nis=lines.nis,
+        line_dof=lines.dof,
+        circle_slot=circles.slot,
+        circle_nis=circles.nis,
+        circle_dof=circles.dof,
+        added=lines.added + circles.added,
+        fused=lines.fused + circles.fused,
+        merged=lines.merged,
+        trimmed=swept.wiped.trimmed,
+        split=swept.wiped.split,
+        deleted=swept.wiped.deleted + circles.deleted,
+        status=status,
+    )
+    return LineMap(lines=swept.lines, circles=circles.model), report
+
+
+class _LineUpdate(NamedTuple):
+    """What became of the lines of a scan, before wiping."""
+
+    model: Lines
+    targets: Array  # [L] slot of the map's line that each new line is now part of, -1 for none
+    own: Array  # [L] the same, or the line of the map that made it ambiguous
+    slot: Array  # [L] for the report
+    nis: Array  # [L]
+    dof: Array  # [L]
+    added: Array
+    fused: Array
+    merged: Array
+    overflow: Array
+
+
+def _update_lines(
+    model: Lines, found: Extraction, pose: Pose, thresholds: Thresholds, rules: Rules
+) -> _LineUpdate:
+    """Section 5.1: match, then fuse or add, then merge."""
+    new = found.lines
+    if rules.share_pose:
+        cov_measurement, jac_line_pose = found.cov_measurement, found.jac_line_pose
+    else:
+        cov_measurement, jac_line_pose = new.cov, jnp.zeros_like(found.jac_line_pose)
+
+    match = matching.match_lines(new, model, thresholds, rules)
+    unmatched = new.valid & (match.slot < 0) & (match.suspect < 0)
+    leader = matching.group_lines(new, cov_measurement, unmatched, thresholds)
+
+    # Leaders take free slots, where they stand as the point to linearise at; their group is fused into them.
+    k = model.valid.shape[0]
+    leads = leader == jnp.arange(leader.shape[0])
+    slot_of_leader, overflow = _free_slots(leads, model.valid)
+    model, before = _put(model, new, slot_of_leader), model
+    targets = jnp.where(leader >= 0, slot_of_leader[jnp.maximum(leader, 0)], match.slot)
+    pieces = fusion.Pieces(
+        lines=new, target=targets, cov_measurement=cov_measurement, jac_line_pose=jac_line_pose
+    )
+    model = fusion.fuse_lines(model, before.valid, pieces, pose.cov, thresholds, rules)
+
+    is_target = jnp.zeros(k, bool).at[jnp.where(targets < 0, k, targets)].set(True, mode="drop")
+    fused = jnp.sum(is_target & before.valid, dtype=jnp.int32)
+    slot = jnp.where(leader >= 0, NEW, match.slot)
+    slot = jnp.where(targets < 0, LEFT_OUT, slot)
+    merged = jnp.zeros((), jnp.int32)
+    if rules.merge:
+        model, moved, merged = _merge(model, targets, thresholds, rules)
+        targets = jnp.where(targets >= 0, moved[jnp.maximum(targets, 0)], targets)
+        slot = jnp.where(slot >= 0, moved[jnp.maximum(slot, 0)], slot)
+    return _LineUpdate(
+        model=model,
+        targets=targets,
+        own=jnp.where(targets >= 0, targets, match.suspect),
+        slot=slot,
+        nis=match.nis,
+        dof=jnp.where(match.compared, 2, 0).astype(jnp.int32),
+        added=jnp.sum(slot_of_leader >= 0, dtype=jnp.int32),
+        fused=fused,
+        merged=merged,
+        overflow=overflow,
+    )
+
+
+def _merge(
+    model: Lines, targets: Int[Array, " L"], thresholds: Thresholds, rules: Rules
+) -> tuple[Lines, Int[Array, " K"], Int[Array, ""]]:
+    """Join lines of the map that overlap and agree, where this scan touched one of them.
+
+    The lower slot stays. A line is joined with one other at most; of rival pairs the one with the least NIS is taken.
+
+    Returns:
+      The lines; for each slot where its line now stands; how many were joined.
+    """
+    k = model.valid.shape[0]
+    index = jnp.arange(targets.shape[0])
+    earlier = (targets[:, None] == targets[None]) & (index[None] < index[:, None])
+    asks = (targets >= 0) & ~jnp.any(earlier, -1)
+    at = jnp.maximum(targets, 0)
+    touched = jax.tree.map(lambda x: x[at], model)
+
+    # The line in the lower slot plays the map's part, whichever of the two was touched.
+    as_new = matching.compare_all(touched, model, thresholds)
+    as_model = jax.vmap(jax.vmap(matching.compare_lines, (0, None, None)), (None, 0, None))(model, touched, thresholds)
+    slots = jnp.arange(k, dtype=jnp.int32)
+    lower = slots[None] < at[:, None]
+    pair = jax.tree.map(
+        lambda a, b: jnp.where(lower.reshape(lower.shape + (1,) * (a.ndim - 2)), a, b), as_new, as_model
+    )
+    agree = pair.geometric & (pair.nis < thresholds.match_nis) & (pair.gap < 0)
+    partner, nis, some = matching.least(pair.nis, agree & (slots[None] != at[:, None]) & asks[:, None])
+
+    low, high = jnp.minimum(at, partner), jnp.maximum(at, partner)
+    shared = (
+        (low[:, None] == low[None])
+        | (low[:, None] == high[None])
+        | (high[:, None] == low[None])
+        | (high[:, None] == high[None])
+    )
+    better = (nis[None] < nis[:, None]) | ((nis[None] == nis[:, None]) & (index[None] < index[:, None]))
+    accepted = some & ~jnp.any(shared & better & some[None], -1)
+
+    gone = jnp.where(accepted, high, k)
+    other = jax.tree.map(lambda x: x[high], model)
+    pieces = fusion.Pieces(
+        lines=other,
+        target=jnp.where(accepted, low, -1),
+        cov_measurement=other.cov,
+        jac_line_pose=jnp.zeros((*other.valid.shape, 2, 3), other.cov.dtype),
+    )
+    # Both are estimates of the whole wall: the longer one knows its ends.
+    longest = dataclasses.replace(rules, estimate_ends=False)
+    joined = fusion.fuse_lines(model, model.valid, pieces, jnp.zeros((3, 3), other.cov.dtype), thresholds, longest)
+    times = model.times_detected.at[pieces.target].max(other.times_detected, mode="drop")
+    joined = dataclasses.replace(
+        joined,
+        times_detected=times,
+        valid=joined.valid.at[gone].set(False, mode="drop"),
+    )
+    moved = slots.at[gone].set(low.astype(jnp.int32), mode="drop")
+    return neutral_where_free(joined), moved, jnp.sum(accepted, dtype=jnp.int32)
+
+
+class _Sweep(NamedTuple):
+    """What wiping did."""
+
+    lines: Lines
+    wiped: wiping.Wiped
+    gone: Array  # [C] circles of the map that are no longer there
+
+
+def _sweep(
+    circles: Circles,
+    lines: _LineUpdate,
+    found: Extraction,
+    points: Points,
+    scan: Scan,
+    pose: Pose,
+    thresholds: Thresholds,
+    noise: SensorNoise,
+    rules: Rules,
+) -> _Sweep:
+    """Section 6: by beams or by triangles."""
+    if rules.wipe_by_beams:
+        swath = wiping.swath_of_scan(points, scan, pose, found.line_of_beam, found.lines, lines.own, thresholds)
+        model, wiped = wiping.wipe_lines(
+            lines.model,
+            lambda line, slot: wiping.passed_through(line, slot, swath, pose.cov, thresholds, noise),
+            thresholds,
+        )
+        gone = wiping.passed_circles(circles, swath, pose.cov, thresholds, noise)
+    else:
+        triangles = wiping.triangles_of_scan(points, pose, lines.model, lines.targets, thresholds)
+        model, wiped = wiping.wipe_lines(
+            lines.model, lambda line, slot: wiping.inside_triangles(line, slot, triangles), thresholds
+        )
+        gone = wiping.circles_inside_triangles(circles, triangles)
+    return _Sweep(neutral_where_free(model), wiped, gone)
+
+
+class _CircleUpdate(NamedTuple):
+    """What became of the circles of a scan."""
+
+    model: Circles
+    slot: Array  # [C] for the report
+    nis: Array  # [C]
+    dof: Array  # [C]
+    added: Array
+    fused: Array
+    deleted: Array
+    overflow: Array
+
+
+def _update_circles(
+    model: Circles,
+    found: Extraction,
+    lines: Lines,
+    targets: Int[Array, " L"],
+    gone: Bool[Array, " K"],
+    thresholds: Thresholds,
+    rules: Rules,
+) -> _CircleUpdate:
+    """Section 5.2: match, then fuse or add; and none too close to a line."""
+    new = found.circles
+    match = matching.match_circles(new, model, thresholds, rules)
+    k = model.valid.shape[0]
+    matched = jnp.zeros(k, bool).at[jnp.where(match.slot < 0, k, match.slot)].set(True, mode="drop")
+    gone = gone & ~matched
+    model = fusion.fuse_circles(model, new, match, rules)
+    model = dataclasses.replace(model, valid=model.valid & ~gone)
+
+    fresh = new.valid & (match.slot < 0) & ~match.ambiguous & ~near_lines(new, lines, thresholds)
+    slot, overflow = _free_slots(fresh, model.valid)
+    model = _put(model, new, slot)
+
+    # Only lines that this scan touched can have come near a circle.
+    at = jnp.maximum(targets, 0)
+    touched = jax.tree.map(lambda x: x[at], lines)
+    touched = dataclasses.replace(touched, valid=touched.valid & (targets >= 0))
+    near = near_lines(model, touched, thresholds)
+    model = dataclasses.replace(model, valid=model.valid & ~near)
+    report = jnp.where(match.slot >= 0, match.slot, jnp.where(slot >= 0, NEW, LEFT_OUT))
+    return _CircleUpdate(
+        model=neutral_where_free(model),
+        slot=report,
+        nis=match.nis,
+        dof=match.dof,
+        added=jnp.sum(slot >= 0, dtype=jnp.int32),
+        fused=jnp.sum(matched, dtype=jnp.int32),
+        deleted=jnp.sum(gone, dtype=jnp.int32) + jnp.sum(near, dtype=jnp.int32),
+        overflow=overflow,
+    )
+
+
+def _free_slots(wanted: Bool[Array, " M"], taken: Bool[Array, " K"]) -> tuple[Int[Array, " M"], Bool[Array, ""]]:
+    """A free slot for each that wants one, the lowest first, -1 where there is none; and whether that happened."""
+    k, m = taken.shape[0], wanted.shape[0]
+    free = jnp.nonzero(~taken, size=m, fill_value=k)[0]
+    slot = free[jnp.maximum(jnp.cumsum(wanted) - 1, 0)]
+    fits = wanted & (slot < k)
+    return jnp.where(fits, slot, -1).astype(jnp.int32), jnp.any(wanted & ~fits)
+
+
+def _put(model: SlotsT, new: SlotsT, slot: Int[Array, " M"]) -> SlotsT:
+    """The new primitives in their slots of the map; those with slot -1 are left out."""
+    into = jnp.where(slot < 0, model.valid.shape[0], slot)
+    return jax.tree.map(lambda a, b: a.at[into].set(b, mode="drop"), model, new)

@@ -1,0 +1,195 @@
+"""Sections 5.1.1 and 5.2.1: which new primitive is which primitive of the map, Eqs. (21)-(22).
+
+Lines are compared at the anchor of the new line: the mean of the other line is moved there exactly, its covariance to
+first order. (rho, theta) and (-rho, theta + pi) are one line, and differences of angles are wrapped.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from linemap_jax.core.frames import dot, shift_matrix, wrap_angle
+from linemap_jax.core.propagation import inverse, propagate, quadratic
+from linemap_jax.core.settings import Rules, Thresholds
+from linemap_jax.core.state import Circles, Lines, pytree
+
+
+@pytree
+class LineComparison:
+    """A new line held against one of the map."""
+
+    innovation: Float[Array, "2"]  # (m, rad): new minus map, at the anchor of the new line
+    shift: Float[Array, "2 2"]  # S: moves a small change of the map's line to that anchor
+    sign: Float[Array, ""]  # -1 where the new line has to be taken reversed
+    nis: Float[Array, ""]  # Eq. (21)
+    gap: Float[Array, ""]  # m, along the line; negative where the segments overlap
+    geometric: Bool[Array, ""]  # passes the angle gate, the end-point gate and the gap gate
+
+
+def compare_lines(new: Lines, model: Lines, thresholds: Thresholds) -> LineComparison:
+    """Hold one new line against one line of the map: section 5.1.1.
+
+    The gates on angle and end points widen with the predicted spread of what they gate; the paper's are fixed.
+
+    Args:
+      new: the new line, no batch axis.
+      model: the line of the map, no batch axis.
+      thresholds: `match_...`.
+    """
+    turn = wrap_angle(new.angle - model.angle)
+    reverse = jnp.cos(turn) < 0
+    sign = jnp.where(reverse, -1, 1).astype(turn.dtype)
+    turn = jnp.where(reverse, wrap_angle(turn + jnp.pi), turn)
+
+    step = model.anchor - new.anchor
+    normal, tangent = model.normal, model.tangent
+    shift = shift_matrix(dot(tangent, step))
+    innovation = jnp.stack([sign * new.offset - (model.offset + dot(normal, step)), turn])
+    cov_new = with_sign(new.cov, sign)
+    nis = quadratic(innovation, inverse(cov_new + propagate(shift, model.cov)))
+
+    spread = thresholds.match_sigmas * jnp.sqrt(new.cov[1, 1] + model.cov[1, 1])
+    parallel = jnp.abs(turn) < jnp.maximum(thresholds.match_angle, spread)
+
+    ends = jnp.stack([new.point_at(new.extent[0]), new.point_at(new.extent[1])]) - model.anchor[None]
+    along = ends @ tangent
+    across = jnp.abs(ends @ normal - model.offset)
+    variance = normal_variance(model.cov, along) + normal_variance(new.cov, new.extent)
+    near = across < jnp.maximum(thresholds.match_distance, thresholds.match_sigmas * jnp.sqrt(variance))
+
+    gap = jnp.maximum(jnp.min(along) - model.extent[1], model.extent[0] - jnp.max(along))
+    geometric = new.valid & model.valid & parallel & jnp.all(near) & (gap < thresholds.match_gap)
+    return LineComparison(innovation=innovation, shift=shift, sign=sign, nis=nis, gap=gap, geometric=geometric)
+
+
+def compare_all(new: Lines, model: Lines, thresholds: Thresholds) -> LineComparison:
+    """Every new line against every line of the map. Each field gets the leading axes `[L, K]`."""
+    by_model = jax.vmap(compare_lines, (None, 0, None))
+    return jax.vmap(by_model, (0, None, None))(new, model, thresholds)
+
+
+def normal_variance(cov: Float[Array, "2 2"], along: Float[Array, "*s"]) -> Float[Array, "*s"]:
+    """Variance of a line's position along its normal, `along` metres from the anchor, m^2."""
+    return cov[0, 0] - 2 * along * cov[0, 1] + along**2 * cov[1, 1]
+
+
+def with_sign(cov: Float[Array, "*s 2 2"], sign: Float[Array, "*s"]) -> Float[Array, "*s 2 2"]:
+    """Covariance of (sign offset, angle)."""
+    one = jnp.ones_like(sign)
+    return cov * jnp.stack([jnp.stack([one, sign], -1), jnp.stack([sign, one], -1)], -2)
+
+
+def least(
+    nis: Float[Array, "L K"], candidates: Bool[Array, "L K"]
+) -> tuple[Int[Array, " L"], Float[Array, " L"], Bool[Array, " L"]]:
+    """The candidate with the least NIS: its slot, its NIS (0 for none), and whether there is one."""
+    masked = jnp.where(candidates, nis, jnp.inf)
+    some = jnp.any(candidates, -1)
+    return jnp.argmin(masked, -1).astype(jnp.int32), jnp.where(some, jnp.min(masked, -1), 0), some
+
+
+@pytree
+class LineMatches:
+    """What matching says of each new line."""
+
+    slot: Int[Array, " L"]  # of the map, -1 for none
+    suspect: Int[Array, " L"]  # the line of the map that made a new line ambiguous, -1 for none
+    nis: Float[Array, " L"]  # of the best geometric candidate, before the statistical gate; 0 for none
+    compared: Bool[Array, " L"]  # there was a geometric candidate
+
+
+def match_lines(new: Lines, model: Lines, thresholds: Thresholds, rules: Rules) -> LineMatches:
+    """Find for each new line the line of the map that it is: section 5.1.1.
+
+    Among several candidates the one with the least normalised distance is taken; the paper does not say.
+
+    Args:
+      new: the lines of a scan.
+      model: the lines of the map.
+      thresholds: `match_...`.
+      rules: `leave_out_ambiguous`.
+    """
+    pair = compare_all(new, model, thresholds)
+    slot, _, matched = least(pair.nis, pair.geometric & (pair.nis < thresholds.match_nis))
+    nearest, nis, compared = least(pair.nis, pair.geometric)
+    ambiguous = compared & ~matched & rules.leave_out_ambiguous
+    return LineMatches(
+        slot=jnp.where(matched, slot, -1), suspect=jnp.where(ambiguous, nearest, -1), nis=nis, compared=compared
+    )
+
+
+def group_lines(
+    new: Lines, cov: Float[Array, "L 2 2"], unmatched: Bool[Array, " L"], thresholds: Thresholds
+) -> Int[Array, " L"]:
+    """Pieces of one wall that the map does not hold yet: for each unmatched line the one that leads its group.
+
+    The paper takes the lines of a scan one after the other, so that a second piece finds the first one in the map. Here
+    all are taken at once, and this stands in for it.
+
+    Args:
+      new: the lines of a scan.
+      cov: the covariances to compare by.
+      unmatched: the lines that are to be grouped.
+      thresholds: `match_...`.
+
+    Returns:
+      The slot of the leader, its own for a leader, -1 for lines that are not unmatched. Shape `[L]`.
+    """
+    with_cov = dataclasses.replace(new, cov=cov)
+    pair = compare_all(with_cov, with_cov, thresholds)
+    candidate = pair.geometric & (pair.nis < thresholds.match_nis)
+    index = jnp.arange(unmatched.shape[0])
+
+    def step(i: Array, leader: Array) -> Array:
+        ok = candidate[i] & (leader == index)  # only lines before i lead yet
+        first = jnp.argmin(jnp.where(ok, pair.nis[i], jnp.inf))
+        mine = jnp.where(jnp.any(ok), first, i)
+        return leader.at[i].set(jnp.where(unmatched[i], mine, -1))
+
+    return jax.lax.fori_loop(0, index.shape[0], step, jnp.full(index.shape, -1, index.dtype)).astype(jnp.int32)
+
+
+@pytree
+class CircleMatches:
+    """What matching says of each new circle."""
+
+    slot: Int[Array, " C"]  # of the map, -1 for none
+    distance: Float[Array, " C"]  # m, to the centre of that circle
+    nis: Float[Array, " C"]  # of the nearest within the distance gate, before the statistical one; 0 for none
+    dof: Int[Array, " C"]
+    ambiguous: Bool[Array, " C"]  # near a circle, but not it
+
+
+def match_circles(new: Circles, model: Circles, thresholds: Thresholds, rules: Rules) -> CircleMatches:
+    """Find for each new circle the circle of the map that it is: section 5.2.1.
+
+    The paper's one criterion is the distance of the centres. Fitted circles have a covariance, and by default must pass
+    a chi-square gate on centre and radius too.
+    """
+
+    def compare(a: Circles, b: Circles) -> tuple[Array, Array, Array]:
+        step = jnp.concatenate([a.center - b.center, (a.radius - b.radius)[None]])
+        distance = jnp.sqrt(dot(step[:2], step[:2]))
+        both = a.fitted & b.fitted
+        cov = jnp.where(both, a.cov + b.cov, jnp.eye(3, dtype=step.dtype))
+        nis = jnp.where(both, quadratic(step, inverse(cov)), 0)
+        near = a.valid & b.valid & (distance < thresholds.circle_match_distance)
+        return jnp.where(near, distance, jnp.inf), nis, both
+
+    by_model = jax.vmap(compare, (None, 0))
+    distance, nis, both = jax.vmap(by_model, (0, None))(new, model)
+    near = jnp.isfinite(distance)
+    agree = near & (~both | (nis < thresholds.circle_match_nis)) if rules.weigh_circles else near
+    slot, _, matched = least(distance, agree)
+    nearest, _, compared = least(distance, near)
+    rows = jnp.arange(slot.shape[0])
+    dof = jnp.where(compared & both[rows, nearest], 3, 0).astype(jnp.int32)
+    return CircleMatches(
+        slot=jnp.where(matched, slot, -1),
+        distance=jnp.where(matched, distance[rows, slot], 0),
+        nis=jnp.where(dof > 0, nis[rows, nearest], 0),
+        dof=dof,
+        ambiguous=compared & ~matched & rules.leave_out_ambiguous,
+    )

@@ -1,0 +1,67 @@
+"""Covariance of f(x) from the covariance of x, and the small symmetric matrices that this takes."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from linemap_jax.core.settings import Jacobians
+
+
+def jacobian(
+    function: Callable[[Float[Array, " n"]], Float[Array, " m"]],
+    derivative: Callable[[Float[Array, " n"]], Float[Array, "m n"]],
+    jacobians: Jacobians,
+) -> Callable[[Float[Array, " n"]], Float[Array, "m n"]]:
+    """The Jacobian of a function: `autodiff` through the function itself, or `analytic`, the hand-derived one beside it.
+
+    Raises:
+      ValueError: if `jacobians` is neither.
+    """
+    if jacobians == "autodiff":
+        return jax.jacfwd(function)
+    if jacobians == "analytic":
+        return derivative
+    raise ValueError(f"jacobians must be 'autodiff' or 'analytic', not {jacobians!r}")
+
+
+def propagate(jac: Float[Array, "*s m n"], cov: Float[Array, "*#s n n"]) -> Float[Array, "*s m m"]:
+    """Covariance of y = f(x) to first order, J C J^T."""
+    cov = jnp.broadcast_to(cov, (*jac.shape[:-2], *cov.shape[-2:]))
+    return symmetric(jac @ cov @ jnp.swapaxes(jac, -1, -2))
+
+
+def symmetric(matrix: Float[Array, "*s n n"]) -> Float[Array, "*s n n"]:
+    """The symmetric part: rounding makes J C J^T a little asymmetric, and it would grow over fusions."""
+    return (matrix + jnp.swapaxes(matrix, -1, -2)) / 2
+
+
+def inverse(matrix: Float[Array, "*s n n"]) -> Float[Array, "*s n n"]:
+    """Inverse of symmetric positive definite matrices of order 2 or 3, in closed form.
+
+    A library solver costs a call per matrix, which under `vmap` over pairs of lines is most of the time. A matrix that
+    is not positive definite (a free slot) gives finite nonsense instead of NaN.
+    """
+    if matrix.shape[-1] == 2:
+        a, b, d = matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 1, 1]
+        det = a * d - b * b
+        scale = 1 / jnp.where(det > 0, det, 1)
+        return _from_rows([[d * scale, -b * scale], [-b * scale, a * scale]])
+    a, b, c = matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 0, 2]
+    d, e, f = matrix[..., 1, 1], matrix[..., 1, 2], matrix[..., 2, 2]
+    c00, c01, c02 = d * f - e * e, c * e - b * f, b * e - c * d
+    c11, c12, c22 = a * f - c * c, b * c - a * e, a * d - b * b
+    det = a * c00 + b * c01 + c * c02
+    scale = 1 / jnp.where(det > 0, det, 1)
+    rows = [[c00, c01, c02], [c01, c11, c12], [c02, c12, c22]]
+    return _from_rows(rows) * scale[..., None, None]
+
+
+def quadratic(vector: Float[Array, "*s n"], matrix: Float[Array, "*s n n"]) -> Float[Array, "*s"]:
+    """x^T A x."""
+    return jnp.einsum("...i,...ij,...j->...", vector, matrix, vector)
+
+
+def _from_rows(rows: list[list[Array]]) -> Array:
+    return jnp.stack([jnp.stack(row, -1) for row in rows], -2)

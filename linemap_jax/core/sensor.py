@@ -1,0 +1,103 @@
+"""Section 4.2: from a range measurement and a pose to a point with a covariance, Eqs. (2)-(4).
+
+Points are held relative to the robot's position, in the axes of the world: coordinates of the world lose the scanner's
+precision in float32 a few hundred metres from the origin.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from linemap_jax.core.frames import perp, rotate, unit
+from linemap_jax.core.propagation import jacobian, propagate
+from linemap_jax.core.settings import Jacobians, Mount, SensorNoise
+from linemap_jax.core.state import Pose, Scan, pytree
+
+
+@pytree
+class Points:
+    """The points of a scan, relative to the robot's position and in the axes of the world."""
+
+    position: Float[Array, "N 2"]  # m
+    beam: Float[Array, "N 2"]  # unit vector along the beam
+    laser: Float[Array, "2"]  # m, the scanner
+    jac_point_pose: Float[Array, "N 2 3"]  # F of Eq. (4)
+    jac_point_measurement: Float[Array, "N 2 2"]  # G of Eq. (4), with respect to (range, bearing)
+
+
+def point_from_measurement(
+    pose: Float[Array, "3"], measurement: Float[Array, "2"], mount: Float[Array, "3"]
+) -> Float[Array, "2"]:
+    """f of Eq. (3): a measured point in the world.
+
+    Eq. (2), with the turn of the scanner on the robot added to the bearing (the paper's scanner looks ahead).
+
+    Args:
+      pose: (x, y, theta) of the robot. m, m, rad.
+      measurement: (range, bearing). m, rad.
+      mount: (x, y, theta) of the scanner on the robot. m, m, rad.
+    """
+    return pose[:2] + rotate(pose[2], mount[:2]) + measurement[0] * unit(pose[2] + mount[2] + measurement[1])
+
+
+def jac_point_pose(
+    pose: Float[Array, "3"], measurement: Float[Array, "2"], mount: Float[Array, "3"]
+) -> Float[Array, "2 3"]:
+    """F of Eq. (4), derived by hand: d(point) / d(x, y, theta). Arguments as in `point_from_measurement`."""
+    c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
+    cb, sb = jnp.cos(pose[2] + mount[2] + measurement[1]), jnp.sin(pose[2] + mount[2] + measurement[1])
+    one, zero = jnp.ones_like(c), jnp.zeros_like(c)
+    dx = -mount[0] * s - mount[1] * c - measurement[0] * sb
+    dy = mount[0] * c - mount[1] * s + measurement[0] * cb
+    return jnp.stack([jnp.stack([one, zero, dx]), jnp.stack([zero, one, dy])])
+
+
+def jac_point_measurement(
+    pose: Float[Array, "3"], measurement: Float[Array, "2"], mount: Float[Array, "3"]
+) -> Float[Array, "2 2"]:
+    """G of Eq. (4), derived by hand: d(point) / d(range, bearing). Arguments as in `point_from_measurement`."""
+    angle = pose[2] + mount[2] + measurement[1]
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    return jnp.stack([jnp.stack([c, -measurement[0] * s]), jnp.stack([s, measurement[0] * c])])
+
+
+def cov_measurement(noise: SensorNoise) -> Float[Array, "2 2"]:
+    """C_s of Eq. (4): range and bearing are not correlated."""
+    return jnp.diag(jnp.stack([jnp.asarray(noise.range_sigma), jnp.asarray(noise.bearing_sigma)]) ** 2)
+
+
+def cov_point(points: Points, pose: Pose, noise: SensorNoise) -> Float[Array, "N 2 2"]:
+    """C_p of Eq. (4) for each point. It holds the pose error that all points of the scan share. m^2."""
+    from_pose = propagate(points.jac_point_pose, pose.cov)
+    return from_pose + propagate(points.jac_point_measurement, cov_measurement(noise))
+
+
+def points_from_scan(scan: Scan, pose: Pose, mount: Mount, *, jacobians: Jacobians) -> Points:
+    """All points of a scan, with F and G of Eq. (4).
+
+    Args:
+      scan: `N` beams; masked ones give points that mean nothing.
+      pose: of the robot, in the world.
+      mount: of the scanner, on the robot.
+      jacobians: "autodiff" or "analytic".
+    """
+    # The position of the robot is left out: it adds nothing to the derivatives, and takes digits from the points.
+    here = pose.mean.at[:2].set(0)
+    at = jnp.stack([jnp.asarray(mount.x), jnp.asarray(mount.y), jnp.asarray(mount.theta)]).astype(here.dtype)
+    measurement = jnp.stack([scan.ranges, scan.bearings], -1)
+
+    def by_pose(x: Array, s: Array) -> Array:
+        return jacobian(lambda p: point_from_measurement(p, s, at), lambda p: jac_point_pose(p, s, at), jacobians)(x)
+
+    def by_measurement(s: Array) -> Array:
+        return jacobian(
+            lambda m: point_from_measurement(here, m, at), lambda m: jac_point_measurement(here, m, at), jacobians
+        )(s)
+
+    return Points(
+        position=jax.vmap(lambda s: point_from_measurement(here, s, at))(measurement),
+        beam=unit(here[2] + at[2] + scan.bearings),
+        laser=rotate(here[2], at[:2]),
+        jac_point_pose=jax.vmap(lambda s: by_pose(here, s))(measurement),
+        jac_point_measurement=jax.vmap(by_measurement)(measurement),
+    )

@@ -1,0 +1,159 @@
+"""The choices: thresholds and noise (traced numbers, so that a sweep is a `vmap`), capacities and rules (static).
+
+Two presets run through everything. `paper` is the literal reading of Vandorpe, Van Brussel and Xu (1996); `default`
+is the method with its known faults mended, each mend one option that can be switched alone. The paper prints only two
+of its thresholds (30 cm, and 5 in Eq. (22)); the other values of `paper` are ours, in metres as in the paper.
+"""
+
+import dataclasses
+from typing import Any, Literal, NamedTuple
+
+import chex
+from jaxtyping import Array, Float
+
+from linemap_jax.core.state import pytree
+
+Number = float | Float[Array, ""]
+Segmentation = Literal["incremental"]
+Covariance = Literal["exact", "printed"]
+Jacobians = Literal["autodiff", "analytic"]
+
+
+@pytree
+class Thresholds:
+    """Where the method draws its lines. A gate is the larger of a distance and a multiple of the predicted spread.
+
+    The paper's name stands in brackets.
+    """
+
+    gap_distance: Number = 0.15
+    """[d_critt] Criterion 1: largest distance between successive points of a line, m. `paper`: 0.5."""
+    gap_spacings: Number = 6.0
+    """Criterion 1 widens to this multiple of the arc between the two beams; 6 holds walls down to a grazing angle of
+    10 degrees together. `paper`: 0 (a fixed distance)."""
+    gap_beams: Number = 2.5
+    """[alpha_crit] Criterion 3: largest angle between successive points, in beam spacings. `paper`: 1.5."""
+    line_distance: Number = 0.03
+    """[d_critl] Criterion 2: largest distance of a new point from the line, m. `paper`: 0.05."""
+    line_sigmas: Number = 5.0
+    """Criterion 2 widens to this multiple of the predicted spread of that distance. `paper`: 0."""
+    min_length: Number = 0.3
+    """Shortest line that is modelled, and shortest fragment that wiping leaves, m (s4.3.1, s6.3)."""
+    cluster_distance: Number = 0.3
+    """[d_critc] Largest distance of a new point from the centre of its cluster, m; also the largest radius of a fitted
+    circle."""
+    circle_line_distance: Number = 0.15
+    """Circles whose centre is closer than this to a line are not modelled, m (s4.3.1)."""
+    match_angle: Number = 0.05
+    """[delta theta_crit] Largest difference of direction of matching lines, rad. `paper`: 0.175 (10 degrees)."""
+    match_distance: Number = 0.05
+    """[d_crid] Largest distance of the new line's end points from the line in the map, m. `paper`: 0.2. Wiping by beams
+    takes a return that is no farther from a line than this for a return from it."""
+    match_sigmas: Number = 3.0
+    """Both gates above widen to this multiple of the predicted spread. `paper`: 0."""
+    match_nis: Number = 9.21
+    """Largest normalised distance of matching lines, Eq. (22): 99 % of chi-square with 2 degrees of freedom. `paper`:
+    5, which is 91.8 %, not the 90 % of the text."""
+    match_gap: Number = 0.5
+    """[d_critll] Largest gap between matching lines, measured along the line, m (s5.1.1)."""
+    circle_match_distance: Number = 0.3
+    """[d_critcc] Largest distance between the centres of matching circles, m (s5.2.1)."""
+    circle_match_nis: Number = 11.34
+    """Largest normalised distance of matching fitted circles: 99 % of chi-square with 3 degrees of freedom. Not in the
+    paper, whose circles have no covariance."""
+    end_sigmas: Number = 3.0
+    """End points that agree within this multiple of their spread are averaged; needs `Rules.estimate_ends`."""
+    wipe_extension: Number = 0.05
+    """How far wiping reaches behind a line that was seen, m (s6.2). `paper`: 0.1."""
+    wipe_sigmas: Number = 3.0
+    """A beam has passed through a line or circle if it ends beyond it by this multiple of the predicted spread; needs
+    `Rules.wipe_by_beams`."""
+
+
+@pytree
+class SensorNoise:
+    """Standard deviations of one measurement, the square roots of C_s in Eq. (4)."""
+
+    range_sigma: Number = 0.02
+    """Of a range, m."""
+    bearing_sigma: Number = 0.001
+    """Of a bearing, rad."""
+
+
+@chex.dataclass(frozen=True, mappable_dataclass=False)
+class Mount:
+    """Where the scanner sits on the robot: its pose in the robot's frame, Eq. (2)."""
+
+    x: Number = 0.0
+    """Forward of the robot's centre, m."""
+    y: Number = 0.0
+    """To its left, m."""
+    theta: Number = 0.0
+    """Turn of the scanner, counter-clockwise, rad. Not in the paper, where the scanner looks ahead."""
+
+
+class Capacity(NamedTuple):
+    """Number of slots: of a map, or of what one scan may hold. Static: it is part of the compiled shape."""
+
+    lines: int = 256
+    circles: int = 256
+
+
+SCAN_CAPACITY = Capacity(lines=64, circles=64)
+"""Slots for what a single scan holds."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Rules:
+    """Which reading of the method is meant. Static; every field is one departure from the paper, on by default."""
+
+    give_back_point: bool = True
+    """A run that criterion 2 ends gives its last point to the next run: just past a corner, points of the next wall
+    still pass the gate, and they spoil the fit."""
+    fit_circles: bool = True
+    """Fit a circle to a cluster where there are points enough. Eqs. (18)-(20) describe the visible arc: a centre that
+    lies before the pole's and moves with the viewpoint."""
+    share_pose: bool = True
+    """Pieces of one line in one scan share its pose error: it is counted once, not once a piece."""
+    leave_out_ambiguous: bool = True
+    """A new line that passes the geometric gates but fails the statistical one is neither fused nor added. To add it, as
+    the paper does, holds the same wall twice: the gate turns true matches away too."""
+    merge: bool = True
+    """Lines of the map that overlap and agree become one."""
+    estimate_ends: bool = True
+    """End points are estimated. The rule of s5.1.2 only ever lengthens a line, so noise makes it grow."""
+    weigh_circles: bool = True
+    """Circles are fused by their covariance, or by the number of times that they were seen. Eqs. (24)-(25) weigh the
+    newest by one half, however often the other was seen."""
+    wipe_by_beams: bool = True
+    """Wipe what this scan's beams passed through. The paper's triangle spans the whole fused line, also where this
+    scan did not look, and needs a line behind what vanished."""
+
+
+PAPER_THRESHOLDS = Thresholds(
+    gap_distance=0.5,
+    gap_spacings=0.0,
+    gap_beams=1.5,
+    line_distance=0.05,
+    line_sigmas=0.0,
+    match_angle=0.175,
+    match_distance=0.2,
+    match_sigmas=0.0,
+    match_nis=5.0,
+    wipe_extension=0.1,
+)
+
+PAPER_RULES = Rules(**{field.name: False for field in dataclasses.fields(Rules)})
+
+
+def preset(name: Literal["default", "paper"]) -> dict[str, Any]:
+    """The keyword arguments of `extract`, `update` and `build` that make up a preset.
+
+    Raises:
+      ValueError: if there is no preset of that name.
+    """
+    if name == "default":
+        return {"thresholds": Thresholds(), "rules": Rules(), "covariance": "exact"}
+    if name == "paper":
+        return {"thresholds": PAPER_THRESHOLDS, "rules": PAPER_RULES, "covariance": "printed"}
+    raise ValueError(f"no preset {name!r}: choose default or paper")

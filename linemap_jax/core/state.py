@@ -1,0 +1,297 @@
+"""The data that flows through the package: fixed-size padded arrays with a `valid` mask.
+
+A slot whose `valid` is False holds finite neutral values, and nothing that stands in it changes any result.
+Capacities come from shapes, never from a field. Units are metres and radians, angles counter-clockwise.
+"""
+
+import enum
+from typing import Any, TypeVar, dataclass_transform
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=True)
+def pytree(cls: type) -> Any:
+    """Register a class as a frozen, keyword-only dataclass that is a pytree of its fields."""
+    return chex.dataclass(frozen=True, kw_only=True, mappable_dataclass=False)(cls)
+
+
+class Status(enum.IntFlag):
+    """What a pipeline function has to say about its result; the bits are joined by `|`."""
+
+    OK = 0
+    SCAN_LINES_FULL = 1
+    """A scan held more lines than the scan capacity; the last ones are missing."""
+    SCAN_CIRCLES_FULL = 2
+    """A scan held more circles than the scan capacity; the last ones are missing."""
+    MAP_LINES_FULL = 4
+    """The map had no free slot for a line."""
+    MAP_CIRCLES_FULL = 8
+    """The map had no free slot for a circle."""
+    POSE_NOT_FINITE = 16
+    """The pose or its covariance held NaN or infinity; the scan was left out."""
+
+
+@pytree
+class Scan:
+    """One range scan in the frame of the sensor.
+
+    Make one with `Scan.from_ranges`, which masks what is not a return.
+    """
+
+    ranges: Float[Array, " N"]  # m
+    bearings: Float[Array, " N"]  # rad
+    valid: Bool[Array, " N"]
+    spacing: Float[Array, ""]  # rad, between neighbouring beams
+
+    @classmethod
+    def from_ranges(
+        cls, ranges: ArrayLike, bearings: ArrayLike, *, range_min: ArrayLike = 0.0, range_max: ArrayLike = jnp.inf
+    ) -> "Scan":
+        """Build a scan from measured ranges; masks NaN, infinity, zero, negative and out-of-range readings.
+
+        A reading of exactly `range_max` is a no-return: scanners report "nothing seen" that way.
+
+        Args:
+          ranges: measured ranges in metres, in the order of the sweep. Shape `[N]`; its dtype is kept.
+          bearings: angle of each beam in radians, counter-clockwise. Shape `[N]`.
+          range_min: smallest range that counts as a return, in metres (inclusive).
+          range_max: ranges from here on are no-returns, in metres.
+
+        Returns:
+          The scan; masked beams hold zeros.
+
+        Raises:
+          ValueError: if the two arrays are not one-dimensional or differ in length.
+        """
+        r = _as_float(ranges)
+        b = jnp.asarray(bearings, r.dtype)
+        if r.ndim != 1 or r.shape != b.shape:
+            raise ValueError(f"ranges {r.shape} and bearings {b.shape} must be one-dimensional and of one length")
+        finite = jnp.isfinite(b)
+        valid = jnp.isfinite(r) & (r > 0) & (r >= range_min) & (r < range_max) & finite
+        step = jnp.abs(jnp.diff(b)) if r.size > 1 else jnp.zeros(1, r.dtype)
+        spacing = jnp.nan_to_num(jnp.nanmedian(jnp.where(jnp.isfinite(step), step, jnp.nan)))
+        return cls(
+            ranges=jnp.where(valid, r, 0),
+            bearings=jnp.where(finite, b, 0),
+            valid=valid,
+            spacing=spacing.astype(r.dtype),
+        )
+
+
+@pytree
+class Pose:
+    """The pose of the robot in the world, and its covariance."""
+
+    mean: Float[Array, "3"]  # x, y in m, theta in rad
+    cov: Float[Array, "3 3"]  # m^2, m rad, rad^2
+
+    def __post_init__(self) -> None:
+        # Lists are a convenience of the notebook; a list inside a pytree would be a subtree, not an array.
+        for name in ("mean", "cov"):
+            value = getattr(self, name)
+            if isinstance(value, list | tuple):
+                object.__setattr__(self, name, _as_float(value))
+
+
+@pytree
+class Lines:
+    """Line segments, each held relative to an anchor on its own segment.
+
+    The line is the set of points `x` with `normal . (x - anchor) = offset`, where `normal` has the direction `angle`.
+    Its end points are given along the tangent (the normal turned by +90 degrees), measured from the anchor, so that
+    they lie on the line by construction. (rho, theta) of Eq. (1) is a view, `rho_theta`: as a state it fails near the
+    origin of the world and far from it.
+    """
+
+    anchor: Float[Array, "K 2"]  # m, world
+    offset: Float[Array, " K"]  # m, along the normal
+    angle: Float[Array, " K"]  # rad, direction of the normal
+    cov: Float[Array, "K 2 2"]  # of (offset, angle): m^2, m rad, rad^2
+    extent: Float[Array, "K 2"]  # m, begin and end along the tangent; begin <= end
+    var_extent: Float[Array, "K 2"]  # m^2, of the end points along the tangent
+    times_detected: Int[Array, " K"]
+    valid: Bool[Array, " K"]
+
+    @property
+    def normal(self) -> Float[Array, "K 2"]:
+        """Unit normals. Shape `[K, 2]`."""
+        return jnp.stack([jnp.cos(self.angle), jnp.sin(self.angle)], -1)
+
+    @property
+    def tangent(self) -> Float[Array, "K 2"]:
+        """Unit tangents, from begin to end. Shape `[K, 2]`."""
+        return jnp.stack([-jnp.sin(self.angle), jnp.cos(self.angle)], -1)
+
+    @property
+    def begin(self) -> Float[Array, "K 2"]:
+        """Begin points in the world, in metres. Shape `[K, 2]`."""
+        return self.point_at(self.extent[..., 0])
+
+    @property
+    def end(self) -> Float[Array, "K 2"]:
+        """End points in the world, in metres. Shape `[K, 2]`."""
+        return self.point_at(self.extent[..., 1])
+
+    @property
+    def length(self) -> Float[Array, " K"]:
+        """Lengths in metres. Shape `[K]`."""
+        return self.extent[..., 1] - self.extent[..., 0]
+
+    def point_at(self, along: Float[Array, " K"]) -> Float[Array, "K 2"]:
+        """The points that lie `along` metres from the foot of the anchor. Shape `[K, 2]`."""
+        return self.anchor + self.offset[..., None] * self.normal + along[..., None] * self.tangent
+
+
+@pytree
+class Circles:
+    """Circles: clusters of points after Eqs. (18)-(20), or fitted poles.
+
+    `fitted` tells which: a fitted circle is the pole itself and has a covariance; the others describe the visible
+    points and have none (zeros).
+    """
+
+    center: Float[Array, "K 2"]  # m, world
+    radius: Float[Array, " K"]  # m
+    cov: Float[Array, "K 3 3"]  # of (x, y, radius), m^2
+    fitted: Bool[Array, " K"]
+    times_detected: Int[Array, " K"]
+    valid: Bool[Array, " K"]
+
+
+@pytree
+class LineMap:
+    """A map of line segments and circles."""
+
+    lines: Lines
+    circles: Circles
+
+
+@pytree
+class Rejected:
+    """Points that were turned away, by criterion."""
+
+    invalid: Int[Array, ""]  # beams without a return
+    gap: Int[Array, ""]  # broke a run by criterion 1, distance to the previous point
+    distance: Int[Array, ""]  # broke a run by criterion 2, distance to the line
+    bearing: Int[Array, ""]  # broke a run by criterion 3, angle to the previous point
+    too_few: Int[Array, ""]  # lie in runs of fewer than three points
+    too_short: Int[Array, ""]  # lie in runs shorter than the shortest line
+    lone: Int[Array, ""]  # in no line and in no cluster
+    near_line: Int[Array, ""]  # lie in clusters too close to a line to be modelled
+
+
+@pytree
+class Extraction:
+    """What one scan holds, in the frame of the world.
+
+    `lines.cov = cov_measurement + jac_line_pose @ cov_pose @ jac_line_pose^T`: the lines of one scan share the error
+    of its pose, and whoever combines several of them needs the two parts apart.
+    """
+
+    lines: Lines
+    circles: Circles
+    jac_line_pose: Float[Array, "K 2 3"]  # d(offset, angle) / d(x, y, theta)
+    cov_measurement: Float[Array, "K 2 2"]  # of (offset, angle), from the sensor's noise alone
+    line_of_beam: Int[Array, " N"]  # slot in `lines`, -1 for none
+    circle_of_beam: Int[Array, " N"]  # slot in `circles`, -1 for none
+    rejected: Rejected
+    status: Int[Array, ""]
+
+
+@pytree
+class Report:
+    """What one scan did to the map.
+
+    `line_slot` and `circle_slot` tell for each new primitive the slot of the map that it was fused into, `NEW` if it
+    was added, `LEFT_OUT` if it was neither (or its slot is empty). The NIS is that of the best geometric match,
+    before the statistical gate, with `dof` degrees of freedom; where nothing was compared both are zero.
+    """
+
+    line_slot: Int[Array, " L"]
+    line_nis: Float[Array, " L"]
+    line_dof: Int[Array, " L"]
+    circle_slot: Int[Array, " C"]
+    circle_nis: Float[Array, " C"]
+    circle_dof: Int[Array, " C"]
+    added: Int[Array, ""]  # lines and circles new in the map
+    fused: Int[Array, ""]  # lines and circles of the map improved by this scan
+    merged: Int[Array, ""]  # lines of the map joined with another one
+    trimmed: Int[Array, ""]  # lines shortened by wiping
+    split: Int[Array, ""]  # lines cut into several by wiping
+    deleted: Int[Array, ""]  # lines and circles gone
+    status: Int[Array, ""]
+
+
+SlotsT = TypeVar("SlotsT", Lines, Circles)
+
+NEW = -1
+"""In a `Report`: the primitive was added to the map."""
+LEFT_OUT = -2
+"""In a `Report`: the primitive was neither fused nor added."""
+
+
+def empty_lines(capacity: int, dtype: Any = None) -> Lines:
+    """`capacity` free slots for lines. The dtype is jax's default unless given."""
+    dtype = jnp.zeros(0).dtype if dtype is None else dtype
+    return Lines(
+        anchor=jnp.zeros((capacity, 2), dtype),
+        offset=jnp.zeros(capacity, dtype),
+        angle=jnp.zeros(capacity, dtype),
+        cov=jnp.broadcast_to(jnp.eye(2, dtype=dtype), (capacity, 2, 2)),
+        extent=jnp.zeros((capacity, 2), dtype),
+        var_extent=jnp.ones((capacity, 2), dtype),
+        times_detected=jnp.zeros(capacity, jnp.int32),
+        valid=jnp.zeros(capacity, bool),
+    )
+
+
+def empty_circles(capacity: int, dtype: Any = None) -> Circles:
+    """`capacity` free slots for circles. The dtype is jax's default unless given."""
+    dtype = jnp.zeros(0).dtype if dtype is None else dtype
+    return Circles(
+        center=jnp.zeros((capacity, 2), dtype),
+        radius=jnp.zeros(capacity, dtype),
+        cov=jnp.zeros((capacity, 3, 3), dtype),
+        fitted=jnp.zeros(capacity, bool),
+        times_detected=jnp.zeros(capacity, jnp.int32),
+        valid=jnp.zeros(capacity, bool),
+    )
+
+
+def neutral_where_free(slots: SlotsT) -> SlotsT:
+    """The same lines or circles with neutral values in every free slot, so that nothing non-finite lurks there."""
+    k = slots.valid.shape[0]
+    empty = empty_lines if isinstance(slots, Lines) else empty_circles
+
+    def choose(value: Array, neutral: Array) -> Array:
+        return jnp.where(slots.valid.reshape((k,) + (1,) * (value.ndim - 1)), value, neutral)
+
+    return jax.tree.map(choose, slots, empty(k, slots.cov.dtype))
+
+
+def resize(slots: SlotsT, capacity: int) -> SlotsT:
+    """The same lines or circles with room for `capacity` of them; added slots are free.
+
+    Raises:
+      ValueError: if `capacity` is smaller than the present one: primitives would be lost.
+    """
+    have = slots.valid.shape[0]
+    if capacity < have:
+        raise ValueError(f"cannot shrink {have} slots to {capacity}")
+    empty = empty_lines if isinstance(slots, Lines) else empty_circles
+    dtype = slots.cov.dtype
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), slots, empty(capacity - have, dtype))
+
+
+def _as_float(x: ArrayLike | list | tuple) -> Array:
+    """As an array of the dtype that came in; integers and plain numbers become jax's default float."""
+    dtype = getattr(x, "dtype", None)
+    if dtype is not None and jnp.issubdtype(dtype, jnp.floating):
+        return jnp.asarray(x)
+    return jnp.asarray(np.asarray(x, float) if not isinstance(x, jax.Array) else x, jnp.zeros(0).dtype)

@@ -1,0 +1,347 @@
+"""Section 6: what is no longer there leaves the map.
+
+Two readings. The paper's wipe-triangle spans a whole line of the map, as fused, from the scanner, and reaches a little
+behind it. The default goes by what this scan's beams passed through: between two neighbouring beams that both end well
+beyond a line, the line is gone. That wipes no more than the scan saw, needs nothing behind what vanished, opens doors,
+and is narrowed by a beam and by the uncertainty of pose, line and range.
+
+Both answer the same question, which stretches of a line are gone, and share what follows from it.
+"""
+
+import dataclasses
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from linemap_jax.core.frames import dot, perp, reanchor
+from linemap_jax.core.matching import normal_variance
+from linemap_jax.core.propagation import quadratic
+from linemap_jax.core.sensor import Points
+from linemap_jax.core.settings import SensorNoise, Thresholds
+from linemap_jax.core.state import Circles, Lines, Pose, Scan, pytree
+
+NEAR_PARALLEL = 1e-6
+"""Cosine below which a beam and a line do not meet."""
+NEAREST_BASE = 1e-3
+"""m. A line this close to the scanner's own position spans no triangle."""
+
+
+@pytree
+class Swath:
+    """The beams of a scan that returned, first things first: what they prove to be free.
+
+    Positions are relative to the robot, in the axes of the world.
+    """
+
+    beam: Float[Array, "N 2"]  # unit vector
+    range: Float[Array, " N"]  # m
+    reach: Float[Array, " N"]  # m, with the extension behind the line that the beam met
+    own: Int[Array, " N"]  # slot of the map's line that the beam measures, -1 for none
+    valid: Bool[Array, " N"]
+    joined: Bool[Array, " N"]  # neighbour of the next one
+    laser: Float[Array, "2"]
+    robot: Float[Array, "2"]  # m, in the world
+    spacing: Float[Array, ""]
+
+
+@pytree
+class Triangles:
+    """Wipe-triangles, section 6.2: the scanner and the pushed-back ends of a line, from the scanner."""
+
+    first: Float[Array, "L 2"]
+    second: Float[Array, "L 2"]
+    own: Int[Array, " L"]  # slot of the line that spans it
+    valid: Bool[Array, " L"]
+    apex: Float[Array, "2"]  # m, the laser from the robot
+    robot: Float[Array, "2"]  # m, in the world
+
+
+@pytree
+class Wiped:
+    """Counts of what wiping did to lines."""
+
+    trimmed: Int[Array, ""]
+    split: Int[Array, ""]
+    deleted: Int[Array, ""]
+    overflow: Bool[Array, ""]  # a fragment found no free slot
+
+
+Stretches = tuple[Float[Array, " M"], Float[Array, " M"], Bool[Array, " M"]]
+"""Begin and end of stretches along a line, metres from its anchor, and which of them count."""
+
+
+def swath_of_scan(
+    points: Points,
+    scan: Scan,
+    pose: Pose,
+    line_of_beam: Int[Array, " N"],
+    found: Lines,
+    own: Int[Array, " L"],
+    thresholds: Thresholds,
+) -> Swath:
+    """What the beams of a scan passed through.
+
+    Args:
+      points: the points of the scan.
+      scan: the scan.
+      pose: of the robot.
+      line_of_beam: the new line of each beam, -1 for none.
+      found: the new lines.
+      own: for each new line the line of the map that it is, or may be; -1 for none.
+      thresholds: `wipe_extension`, `gap_beams`.
+    """
+    n = scan.ranges.shape[0]
+    order = jnp.nonzero(scan.valid, size=n, fill_value=n - 1)[0]
+    count = jnp.sum(scan.valid)
+    valid = jnp.arange(n) < count
+    bearing = scan.bearings[order]
+    turn = jnp.abs(jnp.concatenate([bearing[1:], bearing[-1:]]) - bearing)
+    followed = jnp.concatenate([valid[1:], jnp.zeros(1, bool)])
+
+    line = jnp.maximum(line_of_beam, 0)
+    to_line = found.anchor - (pose.mean[:2] + points.laser)[None]
+    across = jnp.abs(found.offset + dot(found.normal, to_line))  # the scanner from each line
+    pushed = jnp.where(across > NEAREST_BASE, 1 + thresholds.wipe_extension / jnp.maximum(across, NEAREST_BASE), 0)
+    reach = jnp.where(line_of_beam >= 0, scan.ranges * pushed[line], 0)
+    return Swath(
+        beam=points.beam[order],
+        range=scan.ranges[order],
+        reach=reach[order],
+        own=jnp.where(line_of_beam >= 0, own[line], -1)[order],
+        valid=valid,
+        joined=valid & followed & (turn < thresholds.gap_beams * scan.spacing),
+        laser=points.laser,
+        robot=pose.mean[:2],
+        spacing=scan.spacing,
+    )
+
+
+def passed_through(
+    line: Lines, slot: Int[Array, ""], swath: Swath, cov_pose: Float[Array, "3 3"], thresholds: Thresholds, noise: SensorNoise
+) -> Stretches:
+    """The stretches of a line of the map between neighbouring beams that both passed through it.
+
+    A beam passed through if it ended beyond the line by `wipe_sigmas` of the predicted spread of that distance, which
+    holds the range, the line, the pose and the bearing; and in any case by `match_distance`. A beam that met another
+    line reaches `wipe_extension` behind that. A beam never wipes the line that it is a measurement of.
+
+    Args:
+      line: one line, no batch axis.
+      slot: where it stands in the map.
+      swath: the beams.
+      cov_pose: covariance of the pose.
+      thresholds: `wipe_...`, `match_distance`.
+      noise: of the sensor.
+    """
+    normal, tangent = line.normal, line.tangent
+    start = swath.robot - line.anchor + swath.laser
+    incidence = swath.beam @ normal
+    meets = jnp.abs(incidence) > NEAR_PARALLEL
+    safe = jnp.where(meets, incidence, 1)
+    distance = (line.offset - dot(normal, start)) / safe
+    hit = swath.laser[None] + distance[:, None] * swath.beam
+    along = dot(tangent, start) + distance * (swath.beam @ tangent)
+
+    # n^T F C_pose F^T n with F = [I, perp(hit)]
+    lever = perp(hit) @ normal
+    by_pose = (
+        quadratic(normal, cov_pose[:2, :2]) + 2 * lever * dot(normal, cov_pose[:2, 2]) + lever**2 * cov_pose[2, 2]
+    )
+    by_bearing = (distance * noise.bearing_sigma * (swath.beam @ tangent)) ** 2
+    variance = noise.range_sigma**2 + (normal_variance(line.cov, along) + by_pose + by_bearing) / safe**2
+    margin = jnp.maximum(thresholds.wipe_sigmas * jnp.sqrt(variance), thresholds.match_distance / jnp.abs(safe))
+    reach = jnp.maximum(swath.range - margin, swath.reach)
+
+    on_line = (along > line.extent[0]) & (along < line.extent[1])
+    passes = line.valid & swath.valid & meets & (swath.own != slot) & (distance > 0) & on_line & (distance < reach)
+    gone = swath.joined[:-1] & passes[:-1] & passes[1:]
+    return jnp.minimum(along[:-1], along[1:]), jnp.maximum(along[:-1], along[1:]), gone
+
+
+def triangles_of_scan(
+    points: Points, pose: Pose, model: Lines, targets: Int[Array, " L"], thresholds: Thresholds
+) -> Triangles:
+    """Section 6.2: a triangle for each line of the map that this scan added or improved.
+
+    Args:
+      points: the points of the scan.
+      pose: of the robot.
+      model: the lines of the map.
+      targets: the slots of those lines, -1 for none.
+      thresholds: `wipe_extension`.
+    """
+    at = jnp.maximum(targets, 0)
+    base = jax.tree.map(lambda x: x[at], model)
+    apex = (pose.mean[:2] + points.laser)[None]
+    step = base.anchor - apex
+    across = jnp.abs(base.offset + dot(base.normal, step))
+    push = 1 + thresholds.wipe_extension / jnp.maximum(across, NEAREST_BASE)
+    foot = step + base.offset[:, None] * base.normal
+    ends = [push[:, None] * (foot + base.extent[:, i, None] * base.tangent) for i in (0, 1)]
+    turns_left = _cross(ends[0], ends[1]) > 0
+    return Triangles(
+        first=jnp.where(turns_left[:, None], ends[0], ends[1]),
+        second=jnp.where(turns_left[:, None], ends[1], ends[0]),
+        own=targets,
+        valid=(targets >= 0) & base.valid & (across > NEAREST_BASE),
+        apex=points.laser,
+        robot=pose.mean[:2],
+    )
+
+
+def inside_triangles(line: Lines, slot: Int[Array, ""], triangles: Triangles) -> Stretches:
+    """Section 6.3: the stretches of a line inside the triangles of other lines.
+
+    Args:
+      line: one line, no batch axis.
+      slot: where it stands in the map.
+      triangles: of this scan.
+    """
+    start = line.anchor - triangles.robot - triangles.apex + line.offset * line.normal
+    tangent = line.tangent
+
+    def clip(first: Array, second: Array) -> tuple[Array, Array]:
+        low, high = line.extent[0], line.extent[1]
+        for constant, rate in _sides(start, tangent, first, second):
+            # constant + rate s > 0 inside
+            bound = -constant / jnp.where(rate == 0, 1, rate)
+            low = jnp.where(rate > 0, jnp.maximum(low, bound), low)
+            high = jnp.where(rate < 0, jnp.minimum(high, bound), high)
+            high = jnp.where((rate == 0) & (constant <= 0), low, high)
+        return low, high
+
+    low, high = jax.vmap(clip)(triangles.first, triangles.second)
+    return low, high, line.valid & triangles.valid & (triangles.own != slot) & (high > low)
+
+
+def wipe_lines(
+    model: Lines, stretches: Callable[[Lines, Int[Array, ""]], Stretches], thresholds: Thresholds
+) -> tuple[Lines, Wiped]:
+    """Take the stretches that are gone out of the lines of the map: delete, trim, split (section 6.3).
+
+    Fragments shorter than `min_length` go too. A line may be cut in several places.
+
+    Args:
+      model: the lines of the map.
+      stretches: which stretches of a line are gone, given the line (no batch axis) and its slot.
+      thresholds: `min_length`.
+    """
+    k = model.valid.shape[0]
+    slots = jnp.arange(k, dtype=jnp.int32)
+    cut = jax.vmap(lambda line, slot: jnp.any(stretches(line, slot)[2]))(model, slots)
+
+    def unfinished(carry: tuple[Lines, Array, Array]) -> Array:
+        return jnp.any(carry[1])
+
+    def step(carry: tuple[Lines, Array, Array]) -> tuple[Lines, Array, Array]:
+        lines, todo, counts = carry
+        slot = jnp.argmax(todo).astype(jnp.int32)
+        # Lines are cut as they stood before wiping: what a split has put into a free slot is done with.
+        line = jax.tree.map(lambda x: x[slot], lines)
+        begin, end, keep = remaining(line.extent, stretches(line, slot), thresholds.min_length)
+        rank = jnp.cumsum(keep) - 1
+        pieces = jnp.sum(keep)
+        valid = lines.valid.at[slot].set(False)
+        free = jnp.nonzero(~valid & (slots != slot), size=begin.shape[0], fill_value=k)[0]
+        into = jnp.where(rank == 0, slot, free[jnp.maximum(rank - 1, 0)])
+        into = jnp.where(keep, into, k)
+        fragments = jax.vmap(_fragment, (None, 0, 0))(line, begin, end)
+        lines = dataclasses.replace(lines, valid=valid)
+        lines = jax.tree.map(lambda a, b: a.at[into].set(b, mode="drop"), lines, fragments)
+        lost = jnp.any(keep & (into == k))
+        counts = counts + jnp.stack([pieces == 1, pieces > 1, pieces == 0, lost]).astype(counts.dtype)
+        return lines, todo.at[slot].set(False), counts
+
+    model, _, counts = jax.lax.while_loop(unfinished, step, (model, cut, jnp.zeros(4, jnp.int32)))
+    return model, Wiped(trimmed=counts[0], split=counts[1], deleted=counts[2], overflow=counts[3] > 0)
+
+
+def remaining(
+    extent: Float[Array, "2"], gone: Stretches, min_length: Float[Array, ""]
+) -> tuple[Float[Array, " P"], Float[Array, " P"], Bool[Array, " P"]]:
+    """What is left of a segment, in order along it.
+
+    Args:
+      extent: its begin and end, m.
+      gone: `M` stretches in any order; they may overlap.
+      min_length: of a fragment that is kept, m.
+
+    Returns:
+      Begins and ends of `P = M + 1` candidates, and which of them are fragments to keep.
+    """
+    low, high, counts = gone
+    low, high = jax.lax.sort([jnp.where(counts, low, jnp.inf), jnp.where(counts, high, -jnp.inf)], num_keys=1)
+    covered = jnp.maximum(jax.lax.cummax(high), extent[0])
+    begin = jnp.concatenate([extent[:1], covered])
+    end = jnp.minimum(jnp.concatenate([low, extent[1:]]), extent[1])
+    # The sentinels of stretches that do not count end at the segment's end; only the last such piece is one.
+    last = jnp.concatenate([jnp.isfinite(low), jnp.ones(1, bool)])
+    keep = last & (end - begin >= min_length)
+    return begin, jnp.where(keep, end, begin), keep
+
+
+def _fragment(line: Lines, begin: Float[Array, ""], end: Float[Array, ""]) -> Lines:
+    """A part of a line, anchored at its own middle."""
+    middle = line.anchor + line.offset * line.normal + (begin + end) / 2 * line.tangent
+    part = dataclasses.replace(line, extent=jnp.stack([begin, end]), valid=jnp.ones_like(line.valid))
+    return reanchor(part, middle)
+
+
+def passed_circles(
+    circles: Circles, swath: Swath, cov_pose: Float[Array, "3 3"], thresholds: Thresholds, noise: SensorNoise
+) -> Bool[Array, " C"]:
+    """Which circles of the map the beams of a scan prove to be gone.
+
+    A circle is gone if every beam through the window in which it may stand, at least two of them, ends beyond it; and
+    if it is wide enough for no two beams to pass it by on either side.
+    """
+
+    def gone(center: Array, radius: Array) -> Array:
+        from_robot = center - swath.robot
+        to_center = from_robot - swath.laser
+        distance = jnp.sqrt(dot(to_center, to_center))
+        ahead = to_center / jnp.where(distance > 0, distance, 1)
+
+        def spread(direction: Array) -> Array:
+            jac = jnp.concatenate([direction, dot(direction, perp(from_robot))[None]])
+            return quadratic(jac, cov_pose)
+
+        lateral = jnp.sqrt(spread(perp(ahead)) + (distance * noise.bearing_sigma) ** 2)
+        depth = jnp.sqrt(spread(ahead) + noise.range_sigma**2)
+        along = swath.beam @ to_center
+        window = jnp.abs(_cross(swath.beam, to_center[None])) < radius + thresholds.wipe_sigmas * lateral
+        witness = swath.valid & window & (along > 0)
+        beyond = swath.range > along + radius + thresholds.wipe_sigmas * depth
+        enough = jnp.sum(witness) >= 2
+        return enough & jnp.all(beyond | ~witness) & (2 * radius >= swath.spacing * distance)
+
+    return circles.valid & jax.vmap(gone)(circles.center, circles.radius)
+
+
+def circles_inside_triangles(circles: Circles, triangles: Triangles) -> Bool[Array, " C"]:
+    """Section 6.3: circles are deleted if they lie inside a wipe-triangle. Taken by their centres."""
+
+    def inside(center: Array, first: Array, second: Array) -> Array:
+        start = center - triangles.robot - triangles.apex
+        sides = _sides(start, jnp.zeros_like(start), first, second)
+        return jnp.all(jnp.stack([constant > 0 for constant, _ in sides]))
+
+    every = jax.vmap(jax.vmap(inside, (None, 0, 0)), (0, None, None))
+    hits = every(circles.center, triangles.first, triangles.second)
+    return circles.valid & jnp.any(hits & triangles.valid[None], -1)
+
+
+def _sides(start: Array, tangent: Array, first: Array, second: Array) -> list[tuple[Array, Array]]:
+    """For each side of the triangle (0, first, second): constant and rate of a function of s, positive inside."""
+    base = second - first
+    return [
+        (_cross(first, start), _cross(first, tangent)),
+        (_cross(start, second), _cross(tangent, second)),
+        (_cross(base, start - first), _cross(base, tangent)),
+    ]
+
+
+def _cross(a: Array, b: Array) -> Array:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]

@@ -1,0 +1,1 @@
+"""Files and pictures: logs in, maps out."""

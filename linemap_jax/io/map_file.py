@@ -1,0 +1,318 @@
+"""The map as a JSON file that other tools read, and from which the map comes back without loss.
+
+A line is given twice: as the paper's view, `rho`, `theta`, `cov` of both, `begin`, `end`; and as its state, `anchor`,
+`offset`, `angle`, `cov_local`, `extent`, `var_extent` (the fields of `Lines`), which alone is read back. A circle has a
+`cov`, of (x, y, radius), only if it was fitted. Metres, radians, counter-clockwise. Each line and each circle stands on
+one line of the file.
+"""
+
+import dataclasses
+import json
+import os
+from collections.abc import Mapping
+from typing import Any, Literal, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from linemap_jax.core.lines import rho_theta
+from linemap_jax.core.settings import Capacity
+from linemap_jax.core.state import Circles, LineMap, Lines, empty_circles, empty_lines
+from linemap_jax.io.atomic import OutputError, atomic_write
+
+Columns = dict[str, NDArray[Any]]
+"""Field -> its values of all lines or circles; the first axis counts them, there are no free slots."""
+Slots = TypeVar("Slots", Lines, Circles)
+
+FORMAT = "linemap"
+VERSION = 1
+
+_LINE_STATE = {"anchor": (2,), "offset": (), "angle": (), "cov_local": (2, 2), "extent": (2,), "var_extent": (2,)}
+_LINE_VIEW = {"rho": (), "theta": (), "cov": (2, 2), "begin": (2,), "end": (2,)}
+_CIRCLE = {"center": (2,), "radius": ()}
+
+_ROUNDING = 1e-5
+"""How far rounding to float32 may carry a correlation, or the view's, from what it should be; no unit."""
+
+
+class MapFileError(ValueError):
+    """A map file could not be read or written. The message is one sentence that names the file and the cause."""
+
+
+class _Fault(ValueError):
+    """What is wrong with the content; the file's name is put before it."""
+
+
+def write_map(
+    path: str | os.PathLike[str], line_map: LineMap, settings: Mapping[str, Any], *, overwrite: bool = False
+) -> None:
+    """Write a map as JSON. What cannot be read back is not written.
+
+    Args:
+      path: of the file.
+      line_map: the map; only its valid slots are written.
+      settings: what the map was built with. May hold numbers, strings, lists, arrays, mappings, and dataclasses such
+        as `Thresholds`.
+      overwrite: whether an older file may be replaced.
+
+    Raises:
+      MapFileError: if the file exists and `overwrite` is false, if it cannot be written, or if the map holds numbers
+        that are not finite or covariances that are not positive definite.
+    """
+    try:
+        document = {
+            "format": FORMAT,
+            "version": VERSION,
+            "dtype": str(line_map.lines.cov.dtype),
+            "settings": _plain(settings, "settings"),
+            "lines": _entries_of_lines(line_map.lines),
+            "circles": _entries_of_circles(line_map.circles),
+        }
+        _read_lines(document)
+        _read_circles(document)
+    except _Fault as fault:
+        raise MapFileError(f"cannot write {os.fspath(path)}: {fault}") from None
+    try:
+        with atomic_write(path, overwrite=overwrite) as temporary:
+            temporary.write_text(_text(document), encoding="utf-8", newline="\n")
+    except OutputError as error:
+        raise MapFileError(str(error)) from error
+
+
+def read_map(
+    path: str | os.PathLike[str],
+    *,
+    capacity: Capacity | None = None,
+    dtype: Literal["float32", "float64"] | None = None,
+) -> tuple[LineMap, dict[str, Any]]:
+    """Read a map that `write_map` wrote.
+
+    Args:
+      path: of the file.
+      capacity: slots of the map; the next power of two unless given.
+      dtype: of the map; that of the file unless given.
+
+    Returns:
+      The map, its lines and circles in the order of the file, and the settings.
+
+    Raises:
+      MapFileError: if the file cannot be read, is no map or not of this version, lacks a field, holds a wrong one, a
+        number that is not finite or a covariance that is not symmetric and positive definite; if it does not fit into
+        `capacity`; or if it holds float64 and jax is not set to it.
+    """
+    try:
+        document = _load(path)
+        if dtype is not None:
+            document["dtype"] = dtype
+        lines, circles = _read_lines(document), _read_circles(document)
+        if jax.dtypes.canonicalize_dtype(document["dtype"]) != document["dtype"]:
+            raise _Fault("holds float64 numbers, and jax is not set to them (set JAX_ENABLE_X64=1, or read as float32)")
+        if capacity is None:
+            capacity = Capacity(*(_power_of_two(columns["valid"].size) for columns in (lines, circles)))
+        line_map = LineMap(
+            lines=_fill(empty_lines(capacity.lines, document["dtype"]), lines, "lines"),
+            circles=_fill(empty_circles(capacity.circles, document["dtype"]), circles, "circles"),
+        )
+    except _Fault as fault:
+        raise MapFileError(f"{os.fspath(path)}: {fault}") from None
+    return line_map, document["settings"]
+
+
+def _entries_of_lines(lines: Lines) -> list[dict[str, Any]]:
+    rho, theta, cov = rho_theta(lines)
+    view = {"rho": rho, "theta": theta, "cov": cov, "begin": lines.begin, "end": lines.end}
+    state = {name: lines.cov if name == "cov_local" else getattr(lines, name) for name in _LINE_STATE}
+    return _entries({**view, "times_detected": lines.times_detected, **state}, lines.valid)
+
+
+def _entries_of_circles(circles: Circles) -> list[dict[str, Any]]:
+    columns = {name: getattr(circles, name) for name in ("center", "radius", "times_detected", "cov")}
+    entries = _entries(columns, circles.valid)
+    fitted = np.asarray(circles.fitted)[np.asarray(circles.valid)]
+    for entry, has_cov in zip(entries, fitted, strict=True):
+        if not has_cov:
+            del entry["cov"]
+    return entries
+
+
+def _entries(columns: dict[str, Any], valid: Any) -> list[dict[str, Any]]:
+    """One mapping for each valid slot."""
+    keep = np.asarray(valid)
+    plain = [_plain_numbers(np.asarray(column)[keep]) for column in columns.values()]
+    return [dict(zip(columns, row, strict=True)) for row in zip(*plain, strict=True)]
+
+
+def _plain_numbers(array: NDArray[Any]) -> Any:
+    """Python numbers whose shortest decimal form gives the array back: 0.1, not 0.10000000149011612, for float32."""
+    if array.dtype == np.float32:
+        array = array.astype(str).astype(np.float64)
+    return array.tolist()
+
+
+def _plain(value: Any, where: str) -> Any:
+    """The value in JSON's own types."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    elif isinstance(value, tuple) and (as_dict := getattr(value, "_asdict", None)):  # a NamedTuple
+        value = as_dict()
+    elif isinstance(value, np.generic | np.ndarray | jax.Array):
+        value = _plain_numbers(np.asarray(value))
+
+    if isinstance(value, Mapping):
+        return {str(name): _plain(item, f"{where}.{name}") for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item, f"{where}[{i}]") for i, item in enumerate(value)]
+    if isinstance(value, float) and not np.isfinite(value):
+        raise _Fault(f"{where} is not finite")
+    if value is None or isinstance(value, str | bool | int | float):
+        return value
+    raise TypeError(f"{where}: a {type(value).__name__} has no place in JSON")
+
+
+def _text(document: dict[str, Any]) -> str:
+    """The document as JSON, each entry of a list on a line of its own."""
+
+    def dump(value: Any, indent: int | None = None) -> str:
+        return json.dumps(value, allow_nan=False, indent=indent)
+
+    parts: list[str] = []
+    for name, value in document.items():
+        if isinstance(value, list):
+            body = ",\n    ".join(map(dump, value))
+            text = f"[\n    {body}\n  ]" if value else "[]"
+        else:
+            text = dump(value, indent=2).replace("\n", "\n  ")  # no string holds a bare line feed in JSON
+        parts.append(f"  {dump(name)}: {text}")
+    return "{\n" + ",\n".join(parts) + "\n}\n"
+
+
+def _load(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """The document, its head checked."""
+
+    def refuse(name: str) -> None:
+        raise _Fault(f"holds {name}, a number that is not finite")
+
+    try:
+        with open(path, encoding="utf-8") as file:
+            document = json.load(file, parse_constant=refuse)
+    except OSError as error:
+        raise MapFileError(f"cannot read {os.fspath(path)}: {error.strerror or error}") from error
+    except json.JSONDecodeError as error:
+        raise _Fault(f"line {error.lineno} is not JSON: {error.msg}") from None
+    except (UnicodeDecodeError, RecursionError):
+        raise _Fault("is not JSON") from None
+    if not isinstance(document, dict) or document.get("format") != FORMAT:
+        raise _Fault(f'is not a map: "format" must be "{FORMAT}"')
+    version = document.get("version")
+    if type(version) is not int or version != VERSION:
+        raise _Fault(f"has version {json.dumps(version)}; this program reads version {VERSION}")
+    if document.get("dtype") not in ("float32", "float64"):
+        raise _Fault('"dtype" must be "float32" or "float64"')
+    if not isinstance(document.get("settings"), dict):
+        raise _Fault('"settings" must be an object')
+    document["settings"] = _plain(document["settings"], "settings")
+    return document
+
+
+def _read_lines(document: dict[str, Any]) -> Columns:
+    """The lines of a document, by the fields of `Lines`."""
+    entries = _list_of_objects(document, "lines")
+    columns = {
+        name: _column(entries, "lines", name, shape, document["dtype"])
+        for name, shape in (_LINE_VIEW | _LINE_STATE).items()
+    }
+    _check_cov(columns["cov"], "lines", "cov", slack=_ROUNDING)
+    _check_cov(columns["cov_local"], "lines", "cov_local")
+    _check(columns["extent"][:, 0] <= columns["extent"][:, 1], "lines", "extent", "runs backwards")
+    _check(columns["var_extent"].min(1) >= 0, "lines", "var_extent", "is negative")
+    state = {"cov" if name == "cov_local" else name: columns[name] for name in _LINE_STATE}
+    return state | _counts(entries, "lines")
+
+
+def _read_circles(document: dict[str, Any]) -> Columns:
+    """The circles of a document, by the fields of `Circles`."""
+    entries = _list_of_objects(document, "circles")
+    dtype = document["dtype"]
+    columns = {name: _column(entries, "circles", name, shape, dtype) for name, shape in _CIRCLE.items()}
+    _check(columns["radius"] >= 0, "circles", "radius", "is negative")
+    fitted = np.array(["cov" in entry for entry in entries], bool)
+    none = np.zeros((3, 3)).tolist()
+    cov = _column([{"cov": none, **entry} for entry in entries], "circles", "cov", (3, 3), dtype)
+    _check_cov(cov, "circles", "cov", exempt=~fitted)
+    return columns | {"cov": cov, "fitted": fitted} | _counts(entries, "circles")
+
+
+def _list_of_objects(document: dict[str, Any], kind: str) -> list[dict[str, Any]]:
+    entries = document.get(kind)
+    if not isinstance(entries, list):
+        raise _Fault(f'"{kind}" must be a list')
+    for i, entry in enumerate(entries):
+        if not isinstance(entry, dict):
+            raise _Fault(f"{kind}[{i}] must be an object")
+    return entries
+
+
+def _column(entries: list[dict[str, Any]], kind: str, name: str, shape: tuple[int, ...], dtype: str) -> NDArray[Any]:
+    """One field of all entries, as an array `[len(entries), *shape]`."""
+    column = np.zeros((len(entries), *shape), dtype)
+    largest = float(np.finfo(column.dtype).max)
+    for i, entry in enumerate(entries):
+        if name not in entry:
+            raise _Fault(f'{kind}[{i}] has no "{name}"')
+        value = np.array(entry[name], dtype=object)
+        if value.shape != shape or not all(type(x) in (int, float) for x in value.flat):
+            wanted = " by ".join(map(str, shape)) + " numbers" if shape else "a number"
+            raise _Fault(f"{kind}[{i}].{name} must be {wanted}")
+        if not all(-largest <= x <= largest for x in value.flat):
+            raise _Fault(f"{kind}[{i}].{name} is not finite in {dtype}")
+        column[i] = value.astype(np.float64)
+    return column
+
+
+def _counts(entries: list[dict[str, Any]], kind: str) -> Columns:
+    for i, entry in enumerate(entries):
+        times = entry.get("times_detected")
+        if type(times) is not int or not 0 <= times <= np.iinfo(np.int32).max:
+            raise _Fault(f"{kind}[{i}].times_detected must be a whole number, 0 or more")
+    times = np.array([entry["times_detected"] for entry in entries], np.int32)
+    return {"times_detected": times, "valid": np.ones(len(entries), bool)}
+
+
+def _check_cov(
+    cov: NDArray[Any], kind: str, name: str, *, exempt: NDArray[np.bool_] | bool = False, slack: float = 0.0
+) -> None:
+    """Refuse covariances that are not symmetric positive definite.
+
+    Judged on the correlations, in float64: the units differ within one matrix. `slack` lets eigenvalues of the
+    correlations be as small as `-slack`, for a covariance that was derived from a sound one in float32.
+    """
+    cov = cov.astype(np.float64)
+    variance = np.diagonal(cov, axis1=-2, axis2=-1)
+    sigma = np.sqrt(np.where(variance > 0, variance, 1))
+    correlation = cov / (sigma[:, :, None] * sigma[:, None, :])
+    symmetric = np.abs(correlation - np.swapaxes(correlation, -1, -2)).max((-2, -1), initial=0) <= _ROUNDING
+    definite = (variance > 0).all(-1) & (np.linalg.eigvalsh(correlation).min(-1, initial=1) > -slack)
+    _check(symmetric & definite | exempt, kind, name, "is not symmetric positive definite")
+
+
+def _check(good: NDArray[Any], kind: str, name: str, fault: str) -> None:
+    if not good.all():
+        raise _Fault(f"{kind}[{int(np.argmin(good))}].{name} {fault}")
+
+
+def _fill(empty: Slots, columns: Columns, kind: str) -> Slots:
+    """The slots of `empty`, the first ones filled."""
+    count, capacity = columns["valid"].size, empty.valid.size
+    if count > capacity:
+        raise _Fault(f"holds {count} {kind}, more than the {capacity} slots asked for")
+    filled = {
+        name: jnp.asarray(np.concatenate([column, np.asarray(getattr(empty, name))[count:]]))
+        for name, column in columns.items()
+    }
+    return dataclasses.replace(empty, **filled)
+
+
+def _power_of_two(count: int) -> int:
+    return 1 << max(count - 1, 0).bit_length()

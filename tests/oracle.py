@@ -1,0 +1,1487 @@
+"""An oracle: the mapper once more, in plain NumPy and float64, to hold the package against.
+
+It shares no computation with the package. From there come only the settings, the status bits and the two codes of a
+report. It is written to be read: loops over lines and runs, arrays without padding (but for the slots of a map, which
+are compared one by one), every Jacobian by hand.
+
+The letters, in the frame of the world unless said otherwise: `p` is the position of the robot, `laser` the position
+of the scanner relative to it, `o` a measured point relative to it, `u` the direction of a beam; `normal` has the
+direction `angle`, `tangent` is the normal turned by +90 degrees. Points are taken relative to the robot, so that
+nothing depends on how far away the origin of the world is.
+"""
+
+import dataclasses
+import math
+from types import SimpleNamespace
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from linemap_jax.core.state import LEFT_OUT, NEW, Status
+
+# A beam that is closer than this to parallel to a line (cosine of the angle to its normal) does not cross it.
+PARALLEL = 1e-6
+# A laser closer than this to a line (m) sees it edge on: "so much behind the line" has no meaning.
+EDGE_ON = 1e-3
+# The end of a grazed line is uncertain by at most this much of a beam: the smallest |normal . u| that is used.
+GRAZING = 0.1
+GAUSS_NEWTON_STEPS = 5
+FEWEST_CIRCLE_POINTS = 5
+# Points whose scatter is flatter than this have no circle: determinant of the scatter over its squared trace.
+FLAT = 1e-6
+
+
+@dataclasses.dataclass
+class Lines:
+    """Line segments; the fields of `linemap_jax.core.state.Lines`."""
+
+    anchor: np.ndarray  # [K, 2]
+    offset: np.ndarray  # [K]
+    angle: np.ndarray  # [K]
+    cov: np.ndarray  # [K, 2, 2]
+    extent: np.ndarray  # [K, 2]
+    var_extent: np.ndarray  # [K, 2]
+    times_detected: np.ndarray  # [K]
+    valid: np.ndarray  # [K]
+
+    @property
+    def normal(self) -> np.ndarray:
+        """Unit normals. Shape `[K, 2]`."""
+        return np.stack([np.cos(self.angle), np.sin(self.angle)], -1)
+
+    @property
+    def tangent(self) -> np.ndarray:
+        """Unit tangents, from begin to end. Shape `[K, 2]`."""
+        return np.stack([-np.sin(self.angle), np.cos(self.angle)], -1)
+
+    @property
+    def begin(self) -> np.ndarray:
+        """Begin points in the world, m. Shape `[K, 2]`."""
+        return self.point_at(self.extent[:, 0])
+
+    @property
+    def end(self) -> np.ndarray:
+        """End points in the world, m. Shape `[K, 2]`."""
+        return self.point_at(self.extent[:, 1])
+
+    def point_at(self, along: np.ndarray) -> np.ndarray:
+        """The points that lie `along` metres from the foot of the anchor. Shape `[K, 2]`."""
+        return self.anchor + self.offset[:, None] * self.normal + along[:, None] * self.tangent
+
+    def take(self, index: Any) -> "Lines":
+        """The lines at `index` (a list or an array of slots)."""
+        index = np.atleast_1d(np.asarray(index, int))
+        return Lines(**{field.name: getattr(self, field.name)[index] for field in dataclasses.fields(self)})
+
+
+@dataclasses.dataclass
+class Circles:
+    """Circles; the fields of `linemap_jax.core.state.Circles`."""
+
+    center: np.ndarray  # [K, 2]
+    radius: np.ndarray  # [K]
+    cov: np.ndarray  # [K, 3, 3]
+    fitted: np.ndarray  # [K]
+    times_detected: np.ndarray  # [K]
+    valid: np.ndarray  # [K]
+
+
+@dataclasses.dataclass
+class OracleMap:
+    """A map in padded slots, those of the package one by one. A slot that is not valid holds neutral values."""
+
+    lines: Lines
+    circles: Circles
+
+
+@dataclasses.dataclass
+class Extraction:
+    """What one scan holds; nothing is padded."""
+
+    lines: Lines  # [n]
+    circles: Circles  # [m]
+    jac_line_pose: np.ndarray  # [n, 2, 3]
+    cov_measurement: np.ndarray  # [n, 2, 2]
+    line_of_beam: np.ndarray  # [N]
+    circle_of_beam: np.ndarray  # [N]
+    rejected: dict[str, int]
+    status: int
+    deciding_margin: float
+    """How close the closest decision of this scan was to its threshold, m or rad (for the shape of a circle: a plain
+    number): two implementations may differ where this is of the size of their rounding."""
+
+
+@dataclasses.dataclass
+class Report:
+    """What one scan did to the map; the fields of `linemap_jax.core.state.Report`, not padded."""
+
+    line_slot: np.ndarray  # [n]
+    line_nis: np.ndarray  # [n]
+    line_dof: np.ndarray  # [n]
+    circle_slot: np.ndarray  # [m]
+    circle_nis: np.ndarray  # [m]
+    circle_dof: np.ndarray  # [m]
+    added: int = 0
+    fused: int = 0
+    merged: int = 0
+    trimmed: int = 0
+    split: int = 0
+    deleted: int = 0
+    status: int = 0
+
+
+class Sweep(NamedTuple):
+    """The valid beams of a scan, in their order, with all that one needs to know about them."""
+
+    beam: np.ndarray  # [n], index in the scan
+    r: np.ndarray  # [n]
+    bearing: np.ndarray  # [n]
+    u: np.ndarray  # [n, 2]
+    o: np.ndarray  # [n, 2]
+    p: np.ndarray  # [2]
+    laser: np.ndarray  # [2]
+    cov_pose: np.ndarray  # [3, 3]
+    spacing: float
+    sr: float  # range_sigma
+    sa: float  # bearing_sigma
+
+
+class Margin:
+    """Keeps the smallest distance of a decision from its threshold."""
+
+    def __init__(self) -> None:
+        """Start with no decision at all."""
+        self.smallest = math.inf
+
+    def below(self, value: float, threshold: float) -> bool:
+        """Whether `value < threshold`, noting how clear that is."""
+        self.smallest = min(self.smallest, abs(value - threshold))
+        return bool(value < threshold)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Small geometry
+
+
+def wrap(angle: Any) -> Any:
+    """The angle in (-pi, pi]; an angle that is there already is returned as it is."""
+    return angle - 2 * np.pi * np.ceil((angle - np.pi) / (2 * np.pi))
+
+
+def perp(v: np.ndarray) -> np.ndarray:
+    """The vectors turned by +90 degrees. Shape `[..., 2]`."""
+    return np.stack([-v[..., 1], v[..., 0]], -1)
+
+
+def dot(a: np.ndarray, b: np.ndarray) -> Any:
+    """Dot products along the last axis."""
+    return (a * b).sum(-1)
+
+
+def jac_point_pose(o: np.ndarray) -> np.ndarray:
+    """F of Eq. (4), d(point) / d(x, y, theta), from the point relative to the robot. Shape `[..., 2, 3]`."""
+    eye = np.broadcast_to(np.eye(2), (*o.shape[:-1], 2, 2))
+    return np.concatenate([eye, perp(o)[..., None]], -1)
+
+
+def jac_point_measurement(r: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """G of Eq. (4), d(point) / d(range, bearing). Shape `[..., 2, 2]`."""
+    return np.stack([u, r[..., None] * perp(u)], -1)
+
+
+def lever_matrix(lever: Any) -> np.ndarray:
+    """S = d(offset, angle) / d(offset, angle) from one anchor to another. Shape `[..., 2, 2]`."""
+    lever = np.asarray(lever, float)
+    s = np.zeros((*lever.shape, 2, 2))
+    s[..., 0, 0] = s[..., 1, 1] = 1.0
+    s[..., 0, 1] = lever
+    return s
+
+
+def sandwich(a: np.ndarray, cov: np.ndarray) -> np.ndarray:
+    """`a cov a^T`."""
+    return a @ cov @ np.swapaxes(a, -1, -2)
+
+
+def symmetric(a: np.ndarray) -> np.ndarray:
+    """The symmetric part: what rounding leaves beside it would grow from fusion to fusion."""
+    return 0.5 * (a + np.swapaxes(a, -1, -2))
+
+
+def distance_to_segments(point: np.ndarray, lines: Lines) -> np.ndarray:
+    """Distances of one point from segments, m. Shape `[K]`."""
+    s = np.clip(dot(point - lines.anchor, lines.tangent), lines.extent[:, 0], lines.extent[:, 1])
+    return np.hypot(*(point - lines.point_at(s)).T)
+
+
+def _numbers(settings: Any) -> Any:
+    """The fields of a settings object as plain floats, which are many times faster than arrays of one number."""
+    return SimpleNamespace(**{f.name: float(getattr(settings, f.name)) for f in dataclasses.fields(settings)})
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Extraction: points and runs
+
+
+def sweep_of(
+    ranges: np.ndarray,
+    bearings: np.ndarray,
+    valid: np.ndarray,
+    spacing: float,
+    pose_mean: np.ndarray,
+    pose_cov: np.ndarray,
+    *,
+    noise: Any,
+    mount: Any,
+) -> Sweep:
+    """The points of a scan, Eqs. (2)-(3). The pose must be finite."""
+    noise, mount = _numbers(noise), _numbers(mount)
+    pose_mean, pose_cov = np.asarray(pose_mean, float), np.asarray(pose_cov, float)
+    beam = np.flatnonzero(np.asarray(valid, bool))
+    r, bearing = np.asarray(ranges, float)[beam], np.asarray(bearings, float)[beam]
+    theta = pose_mean[2]
+    c, s = math.cos(theta), math.sin(theta)
+    laser = np.array([c * mount.x - s * mount.y, s * mount.x + c * mount.y])
+    phi = theta + mount.theta + bearing
+    u = np.stack([np.cos(phi), np.sin(phi)], -1)
+    return Sweep(
+        beam=beam,
+        r=r,
+        bearing=bearing,
+        u=u,
+        o=laser + r[:, None] * u,
+        p=pose_mean[:2],
+        laser=laser,
+        cov_pose=pose_cov,
+        spacing=float(spacing),
+        sr=noise.range_sigma,
+        sa=noise.bearing_sigma,
+    )
+
+
+def segment(sweep: Sweep, *, thresholds: Any, rules: Any, margin: Margin) -> tuple[list[list[int]], dict[str, int]]:
+    """Cut the sweep into runs of points that may be lines, s4.3.1.
+
+    Args:
+      sweep: the valid beams.
+      thresholds: the criteria.
+      rules: `give_back_point` is obeyed.
+      margin: notes how clear the decisions were.
+
+    Returns:
+      The runs, each a list of positions in the sweep, and how many of them each criterion has ended.
+    """
+    t = _numbers(thresholds)
+    breaks = {"gap": 0, "distance": 0, "bearing": 0}
+    runs: list[list[int]] = []
+    if not len(sweep.r):
+        return runs, breaks
+    r, bearing = sweep.r.tolist(), sweep.bearing.tolist()
+    xs, ys, us = sweep.o[:, 0].tolist(), sweep.o[:, 1].tolist(), sweep.u.tolist()
+    var_range, var_bearing = sweep.sr**2, sweep.sa**2
+
+    run = [0]
+    x0, y0 = xs[0], ys[0]
+    rx = ry = rxx = ryy = rxy = 0.0
+    for i in range(1, len(r)):
+        x, y = xs[i] - x0, ys[i] - y0
+        broken_by = None
+
+        da = abs(bearing[i] - bearing[i - 1])
+        gap = math.hypot(xs[i] - xs[i - 1], ys[i] - ys[i - 1])
+        if not margin.below(gap, max(t.gap_distance, t.gap_spacings * min(r[i], r[i - 1]) * da)):
+            broken_by = "gap"
+        elif not margin.below(da, t.gap_beams * sweep.spacing):
+            broken_by = "bearing"
+        elif len(run) >= 3:
+            n = len(run)
+            n1, n2, tt = n * rxx - rx * rx, n * ryy - ry * ry, n * rxy - rx * ry
+            # Which regression it is decides, too: the spread along x and along y, in metres.
+            margin.below(math.sqrt(max(n1, 0.0)) / n, math.sqrt(max(n2, 0.0)) / n)
+            if n1 >= n2:
+                width, nu, p = n1, (-tt, n1), n * x - rx
+                e = (n * y - ry) * n1 - tt * p
+            else:
+                width, nu, p = n2, (n2, -tt), n * y - ry
+                e = (n * x - rx) * n2 - tt * p
+            if width > 0:
+                d2 = width * width + tt * tt
+                cos2 = (us[i][0] * nu[0] + us[i][1] * nu[1]) ** 2 / d2
+                spread2 = (var_range * cos2 + r[i] ** 2 * var_bearing * (1 - cos2)) * (1 + 1 / n + p * p / (n * width))
+                reach = max(t.line_distance, t.line_sigmas * math.sqrt(spread2))
+                if not margin.below(abs(e) / (n * math.sqrt(d2)), reach):
+                    broken_by = "distance"
+            else:
+                broken_by = "distance"
+
+        if broken_by is None:
+            run.append(i)
+        else:
+            breaks[broken_by] += 1
+            if broken_by == "distance" and rules.give_back_point:
+                start = [run.pop(), i]
+            else:
+                start = [i]
+            runs.append(run)
+            run = start
+            x0, y0 = xs[run[0]], ys[run[0]]
+            rx = ry = rxx = ryy = rxy = 0.0
+            x, y = xs[i] - x0, ys[i] - y0
+        rx, ry = rx + x, ry + y
+        rxx, ryy, rxy = rxx + x * x, ryy + y * y, rxy + x * y
+    runs.append(run)
+    return runs, breaks
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Extraction: lines
+
+
+class Regression(NamedTuple):
+    """A line through points: y = slope x + ..., or x = slope y + ... if `steep`; `sign` turns it to the last point."""
+
+    steep: bool
+    slope: float
+    sign: float
+    centroid: np.ndarray  # [2]
+
+    @property
+    def angle(self) -> float:
+        """Direction of the normal, rad."""
+        along = (self.slope, 1.0) if self.steep else (1.0, self.slope)
+        return float(wrap(math.atan2(self.sign * along[1], self.sign * along[0]) - math.pi / 2))
+
+
+def regression(points: np.ndarray) -> Regression:
+    """Eqs. (5)-(8), with sums relative to the first point. The points have shape `[n, 2]`."""
+    n = len(points)
+    x, y = (points - points[0]).T
+    rx, ry, rxx, ryy, rxy = x.sum(), y.sum(), (x * x).sum(), (y * y).sum(), (x * y).sum()
+    n1, n2, tt = n * rxx - rx**2, n * ryy - ry**2, n * rxy - rx * ry
+    steep = n1 < n2
+    width = n2 if steep else n1
+    slope = tt / width if width > 0 else 0.0
+    direction = (slope, 1.0) if steep else (1.0, slope)
+    sign = 1.0 if direction @ (points[-1] - points[0]) >= 0 else -1.0
+    return Regression(bool(steep), float(slope), sign, points[0] + np.array([rx, ry]) / n)
+
+
+def line_from_points(points: np.ndarray, anchor: np.ndarray) -> np.ndarray:
+    """(offset, angle) of the regression line, which `jac_line_points` is the Jacobian of.
+
+    The offset is that from `anchor`, which is in the frame of the points.
+    """
+    line = regression(points)
+    normal = np.array([math.cos(line.angle), math.sin(line.angle)])
+    return np.array([normal @ (line.centroid - anchor), line.angle])
+
+
+def jac_line_points(points: np.ndarray, anchor: np.ndarray) -> np.ndarray:
+    """J, d(offset, angle) / d(point) for each point at a fixed anchor; Eqs. (11)-(17) without their misprints.
+
+    With x, y relative to the anchor, w = sqrt(1 + slope^2), and a bar for a mean, the line is
+
+      y = m x + q, tangent sign (1, m) / w, normal sign (m, -1) / w: offset = -sign q / w, angle = atan(m) + const;
+      x = s y + t, tangent sign (s, 1) / w, normal sign (1, -s) / w: offset = sign t / w, angle = -atan(s) + const.
+
+    The paper prints only the first case, and for rho >= 0.
+
+    Args:
+      points: the points of the run. Shape `[n, 2]`.
+      anchor: a point in the same frame. Shape `[2]`.
+
+    Returns:
+      The Jacobians. Shape `[n, 2, 2]`.
+    """
+    line = regression(points)
+    n, k, sign = len(points), line.slope, line.sign
+    w = math.sqrt(1 + k * k)
+    x_bar, y_bar = line.centroid - anchor
+    x, y = (points - line.centroid).T
+    slope_by, const_by = np.zeros((n, 2)), np.zeros((n, 2))  # d(m or s), d(q or t) by (x_i, y_i)
+    if not line.steep:
+        width = (x * x).sum()
+        slope_by[:, 0] = (y - 2 * k * x) / width
+        slope_by[:, 1] = x / width
+        # q = y_bar - m x_bar
+        const = y_bar - k * x_bar
+        const_by[:, 0] = -k / n - x_bar * slope_by[:, 0]
+        const_by[:, 1] = 1 / n - x_bar * slope_by[:, 1]
+        h = np.array([[sign * const * k / w**3, -sign / w], [1 / w**2, 0.0]])
+    else:
+        width = (y * y).sum()
+        slope_by[:, 0] = y / width
+        slope_by[:, 1] = (x - 2 * k * y) / width
+        # t = x_bar - s y_bar
+        const = x_bar - k * y_bar
+        const_by[:, 0] = 1 / n - y_bar * slope_by[:, 0]
+        const_by[:, 1] = -k / n - y_bar * slope_by[:, 1]
+        h = np.array([[-sign * const * k / w**3, sign / w], [-1 / w**2, 0.0]])
+    return h @ np.stack([slope_by, const_by], 1)
+
+
+def _line_of_run(sweep: Sweep, run: list[int], *, covariance: str) -> dict[str, np.ndarray]:
+    """The fields of one line from its points: estimate, end points, covariance; s4.2.3-4.2.5."""
+    o, r, u = sweep.o[run], sweep.r[run], sweep.u[run]
+    line = regression(o)
+    anchor = sweep.p + line.centroid
+    # What the rounded anchor misses of the centroid goes into the offset.
+    here = anchor - sweep.p
+    normal = np.array([math.cos(line.angle), math.sin(line.angle)])
+    tangent = np.array([-normal[1], normal[0]])
+    offset = normal @ (line.centroid - here)
+    extent = np.array([tangent @ (o[0] - here), tangent @ (o[-1] - here)])
+
+    f, g = jac_point_pose(o), jac_point_measurement(r, u)
+    cov_sensor = sandwich(g, np.diag([sweep.sr**2, sweep.sa**2]))
+    cov_points = sandwich(f, sweep.cov_pose) + cov_sensor
+    cov_measurement, jac_line_pose, cov = np.eye(2), np.zeros((2, 3)), np.eye(2)
+    # Points that are all equal are no line; their run is too short, and its covariance is never looked at.
+    if extent[1] > extent[0]:
+        j = jac_line_points(o, here)
+        if covariance == "printed":
+            # Departure that the paper makes, not we: Eq. (12) sums the pose error as if each point had its own.
+            cov_measurement = symmetric(sandwich(j, cov_points).sum(0))
+            cov = cov_measurement
+        else:
+            cov_measurement = symmetric(sandwich(j, cov_sensor).sum(0))
+            jac_line_pose = (j @ f).sum(0)
+            cov = symmetric(cov_measurement + sandwich(jac_line_pose, sweep.cov_pose))
+
+    var_extent = np.zeros(2)
+    for side, k in ((0, 0), (1, -1)):
+        beam_on_line = sweep.spacing * r[k] / max(abs(normal @ u[k]), GRAZING)
+        var_extent[side] = tangent @ cov_points[k] @ tangent + beam_on_line**2 / 12
+    return {
+        "anchor": anchor,
+        "offset": offset,
+        "angle": line.angle,
+        "cov": cov,
+        "extent": extent,
+        "var_extent": var_extent,
+        "cov_measurement": cov_measurement,
+        "jac_line_pose": jac_line_pose,
+    }
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Extraction: circles
+
+
+def clusters_of(sweep: Sweep, in_line: np.ndarray, *, thresholds: Any, margin: Margin) -> list[list[int]]:
+    """Groups of consecutive points near their mean, of points that are in no line; s4.3.1 (circles)."""
+    reach = float(thresholds.cluster_distance)
+    clusters: list[list[int]] = []
+    cluster: list[int] = []
+    x0 = y0 = sx = sy = 0.0
+    for i, (x, y) in enumerate(sweep.o.tolist()):
+        if in_line[i]:
+            if cluster:
+                clusters.append(cluster)
+            cluster = []
+            continue
+        if cluster:
+            n = len(cluster)
+            if margin.below(math.hypot(x - x0 - sx / n, y - y0 - sy / n), reach):
+                cluster.append(i)
+                sx, sy = sx + x - x0, sy + y - y0
+                continue
+            clusters.append(cluster)
+        cluster = [i]
+        x0, y0, sx, sy = x, y, 0.0, 0.0
+    if cluster:
+        clusters.append(cluster)
+    return clusters
+
+
+class CircleFit(NamedTuple):
+    """A circle fitted to points, and how well it fits."""
+
+    center: np.ndarray  # [2], relative to the centroid
+    radius: float
+    cov: np.ndarray  # [3, 3], of the sensor's noise
+    chi2: float
+
+
+def fit_circle(
+    z: np.ndarray, u: np.ndarray, r: np.ndarray, *, sr: float, sa: float, margin: Margin
+) -> CircleFit | None:
+    """A circle through points about their centroid: Kasa's start, then Gauss-Newton on the distances.
+
+    Not in the paper, whose Eqs. (18)-(20) describe the visible arc.
+
+    Args:
+      z: points relative to their centroid. Shape `[n, 2]`.
+      u: directions of their beams. Shape `[n, 2]`.
+      r: ranges, m. Shape `[n]`.
+      sr: sigma of a range, m.
+      sa: sigma of a bearing, rad.
+      margin: notes how clear the decisions were.
+
+    Returns:
+      The fit, or None where there is none.
+    """
+    if len(z) < FEWEST_CIRCLE_POINTS:
+        return None
+    x, y = z.T
+    w = x * x + y * y
+    sxx, sxy, syy = (x * x).sum(), (x * y).sum(), (y * y).sum()
+    bx, by = (x * w).sum() / 2, (y * w).sum() / 2
+    det = sxx * syy - sxy**2
+    if sxx + syy == 0 or not margin.below(FLAT, det / (sxx + syy) ** 2):
+        return None
+    c = np.array([bx * syy - by * sxy, by * sxx - bx * sxy]) / det
+    radius = math.sqrt(w.mean() + c @ c)
+    # A step may run away or hit a point; then there is no fit, and no need for a warning.
+    with np.errstate(all="ignore"):
+        try:
+            for _ in range(GAUSS_NEWTON_STEPS):
+                f, e, a = _circle_residuals(z, c, radius)
+                delta = -np.linalg.solve(a.T @ a, a.T @ f)
+                c, radius = c + delta[:2], radius + float(delta[2])
+            f, e, a = _circle_residuals(z, c, radius)
+            b = np.linalg.solve(a.T @ a, a.T)
+        except np.linalg.LinAlgError:
+            return None
+        cos2 = dot(e, u) ** 2
+        v = sr**2 * cos2 + r**2 * sa**2 * (1 - cos2)
+        cov = symmetric((b * v) @ b.T)
+        chi2 = float((f**2 / v).sum())
+    if not (np.isfinite(c).all() and math.isfinite(radius) and np.isfinite(cov).all() and math.isfinite(chi2)):
+        return None
+    return CircleFit(c, radius, cov, chi2)
+
+
+def _circle_residuals(z: np.ndarray, c: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Distances from the circle, directions from its centre, and the Jacobian of the distances by (x, y, R)."""
+    away = z - c
+    far = np.hypot(*away.T)
+    e = away / far[:, None]
+    return far - radius, e, np.concatenate([-e, -np.ones((len(z), 1))], 1)
+
+
+def _circle_of_cluster(
+    sweep: Sweep, cluster: list[int], *, thresholds: Any, rules: Any, margin: Margin
+) -> dict[str, Any]:
+    """The fields of one circle from its points: a fitted pole if that is believable, else Eqs. (18)-(20)."""
+    o, r, u = sweep.o[cluster], sweep.r[cluster], sweep.u[cluster]
+    n = len(cluster)
+    centroid = o[0] + (o - o[0]).mean(0)
+    z = o - centroid
+    plain = {
+        "center": sweep.p + centroid,
+        "radius": math.sqrt((z**2).sum() / (n - 1)),
+        "cov": np.zeros((3, 3)),
+        "fitted": False,
+    }
+    if not rules.fit_circles:
+        return plain
+    fit = fit_circle(z, u, r, sr=sweep.sr, sa=sweep.sa, margin=margin)
+    if fit is None:
+        return plain
+    sight = (centroid - sweep.laser) / np.hypot(*(centroid - sweep.laser))
+    good = (
+        not margin.below(fit.radius, 5 * sweep.sr)
+        and margin.below(fit.radius, float(thresholds.cluster_distance))
+        and margin.below(0.0, sight @ fit.center)
+        and not margin.below(n + 3 * math.sqrt(2 * n), fit.chi2)
+        and margin.below(math.sqrt(fit.cov[2, 2]), fit.radius / 3)
+    )
+    if not good:
+        return plain
+    center = centroid + fit.center
+    q = np.zeros((3, 3))
+    q[:2] = jac_point_pose(center)
+    return {
+        "center": sweep.p + center,
+        "radius": fit.radius,
+        "cov": symmetric(fit.cov + sandwich(q, sweep.cov_pose)),
+        "fitted": True,
+    }
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Extraction: the whole
+
+
+def extract(
+    ranges: np.ndarray,
+    bearings: np.ndarray,
+    valid: np.ndarray,
+    spacing: float,
+    pose_mean: np.ndarray,
+    pose_cov: np.ndarray,
+    *,
+    thresholds: Any,
+    noise: Any,
+    mount: Any,
+    rules: Any,
+    covariance: Literal["exact", "printed"],
+    capacity: Any,
+) -> Extraction:
+    """The lines and circles of one scan, in the frame of the world.
+
+    Args:
+      ranges: ranges in metres, in the order of the sweep. Shape `[N]`.
+      bearings: bearings in radians, relative to the scanner. Shape `[N]`.
+      valid: which beams are returns. Shape `[N]`.
+      spacing: angle between neighbouring beams, rad.
+      pose_mean: pose of the robot in the world: x, y in m, theta in rad. Shape `[3]`.
+      pose_cov: its covariance. Shape `[3, 3]`.
+      thresholds: a `settings.Thresholds`.
+      noise: a `settings.SensorNoise`.
+      mount: a `settings.Mount`.
+      rules: a `settings.Rules`.
+      covariance: `exact`, or Eq. (12) as `printed`.
+      capacity: a `settings.Capacity`: how many lines and circles are kept.
+
+    Returns:
+      The extraction.
+    """
+    total = len(ranges)
+    status = Status.OK
+    if not (np.isfinite(pose_mean).all() and np.isfinite(pose_cov).all()):
+        status |= Status.POSE_NOT_FINITE
+        valid, pose_mean, pose_cov = np.zeros(total, bool), np.zeros(3), np.eye(3)
+    sweep = sweep_of(ranges, bearings, valid, spacing, pose_mean, pose_cov, noise=noise, mount=mount)
+    margin = Margin()
+    runs, breaks = segment(sweep, thresholds=thresholds, rules=rules, margin=margin)
+    rejected = {"invalid": total - len(sweep.beam), **breaks, "too_few": 0, "too_short": 0, "lone": 0, "near_line": 0}
+
+    line_of_beam, circle_of_beam = np.full(total, -1), np.full(total, -1)
+    in_line = np.zeros(len(sweep.beam), bool)
+    found: list[dict[str, Any]] = []
+    for run in runs:
+        if len(run) < 3:
+            rejected["too_few"] += len(run)
+            continue
+        line = _line_of_run(sweep, run, covariance=covariance)
+        if not margin.below(float(thresholds.min_length), line["extent"][1] - line["extent"][0]):
+            rejected["too_short"] += len(run)
+            continue
+        in_line[run] = True
+        if len(found) == capacity.lines:
+            status |= Status.SCAN_LINES_FULL
+            continue
+        line_of_beam[sweep.beam[run]] = len(found)
+        found.append(line)
+    lines = Lines(
+        anchor=_stack(found, "anchor", (2,)),
+        offset=_stack(found, "offset", ()),
+        angle=_stack(found, "angle", ()),
+        cov=_stack(found, "cov", (2, 2)),
+        extent=_stack(found, "extent", (2,)),
+        var_extent=_stack(found, "var_extent", (2,)),
+        times_detected=np.ones(len(found), int),
+        valid=np.ones(len(found), bool),
+    )
+
+    kept: list[dict[str, Any]] = []
+    for cluster in clusters_of(sweep, in_line, thresholds=thresholds, margin=margin):
+        if len(cluster) == 1:
+            rejected["lone"] += 1
+            continue
+        circle = _circle_of_cluster(sweep, cluster, thresholds=thresholds, rules=rules, margin=margin)
+        nearest = distance_to_segments(circle["center"], lines).min(initial=math.inf)
+        if margin.below(nearest, float(thresholds.circle_line_distance)):
+            rejected["near_line"] += len(cluster)
+            continue
+        if len(kept) == capacity.circles:
+            status |= Status.SCAN_CIRCLES_FULL
+            continue
+        circle_of_beam[sweep.beam[cluster]] = len(kept)
+        kept.append(circle)
+    circles = Circles(
+        center=_stack(kept, "center", (2,)),
+        radius=_stack(kept, "radius", ()),
+        cov=_stack(kept, "cov", (3, 3)),
+        fitted=_stack(kept, "fitted", ()).astype(bool),
+        times_detected=np.ones(len(kept), int),
+        valid=np.ones(len(kept), bool),
+    )
+    return Extraction(
+        lines=lines,
+        circles=circles,
+        jac_line_pose=_stack(found, "jac_line_pose", (2, 3)),
+        cov_measurement=_stack(found, "cov_measurement", (2, 2)),
+        line_of_beam=line_of_beam,
+        circle_of_beam=circle_of_beam,
+        rejected=rejected,
+        status=int(status),
+        deciding_margin=margin.smallest,
+    )
+
+
+def _stack(items: list[dict[str, Any]], key: str, shape: tuple[int, ...]) -> np.ndarray:
+    """One field of all items; of the right shape where there are none."""
+    return np.array([item[key] for item in items], float).reshape(len(items), *shape)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The map and its slots
+
+
+def empty_map(capacity: Any) -> OracleMap:
+    """A map with as many free slots as `capacity` (a `settings.Capacity`) says."""
+    k, c = capacity.lines, capacity.circles
+    return OracleMap(
+        lines=Lines(
+            anchor=np.zeros((k, 2)),
+            offset=np.zeros(k),
+            angle=np.zeros(k),
+            cov=np.tile(np.eye(2), (k, 1, 1)),
+            extent=np.zeros((k, 2)),
+            var_extent=np.ones((k, 2)),
+            times_detected=np.zeros(k, int),
+            valid=np.zeros(k, bool),
+        ),
+        circles=Circles(
+            center=np.zeros((c, 2)),
+            radius=np.zeros(c),
+            cov=np.zeros((c, 3, 3)),
+            fitted=np.zeros(c, bool),
+            times_detected=np.zeros(c, int),
+            valid=np.zeros(c, bool),
+        ),
+    )
+
+
+def _copy(slots: Any) -> Any:
+    return type(slots)(**{field.name: getattr(slots, field.name).copy() for field in dataclasses.fields(slots)})
+
+
+def _put(slots: Any, slot: int, **values: Any) -> None:
+    """Write some fields of one slot."""
+    for name, value in values.items():
+        getattr(slots, name)[slot] = value
+
+
+def _free(slots: Any, slot: int) -> None:
+    """Make a slot free, with the neutral values of an empty map."""
+    empty = empty_map(SimpleNamespace(lines=1, circles=1))
+    neutral = empty.lines if isinstance(slots, Lines) else empty.circles
+    _put(slots, slot, **{field.name: getattr(neutral, field.name)[0] for field in dataclasses.fields(slots)})
+
+
+def _lowest_free(slots: Any) -> int | None:
+    free = np.flatnonzero(~slots.valid)
+    return int(free[0]) if len(free) else None
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Matching of lines
+
+
+class Gates(NamedTuple):
+    """New lines against lines of the map, pair by pair."""
+
+    sign: np.ndarray  # [K], -1 where the new line runs the other way
+    residual: np.ndarray  # [K, 2], (offset, angle) of the new line minus that of the map, at the new line's anchor
+    lever: np.ndarray  # [K], of the new line's anchor
+    nis: np.ndarray  # [K], Eq. (21)
+    gap: np.ndarray  # [K], m, along the map's line; negative where the two overlap
+    geometric: np.ndarray  # [K]
+    statistical: np.ndarray  # [K], Eq. (22)
+
+
+def gates(new: Lines, old: Lines, *, thresholds: Any) -> Gates:
+    """All gates of s5.1.1, for lines of equal number, or one against many.
+
+    Both lines are compared at the anchor of the new one, with the covariances that they come with.
+    """
+    t = _numbers(thresholds)
+    d = wrap(new.angle - old.angle)
+    reverse = np.cos(d) < 0
+    sign = np.where(reverse, -1.0, 1.0)
+    turn = np.where(reverse, wrap(d + np.pi), d)
+    shift = old.anchor - new.anchor
+    lever = dot(old.tangent, shift)
+    residual = np.stack([sign * new.offset - (old.offset + dot(old.normal, shift)), turn], -1)
+    cov = signed_cov(new.cov, sign) + sandwich(lever_matrix(lever), old.cov)
+    nis = dot(residual, np.linalg.solve(cov, residual[..., None])[..., 0])
+
+    spread_angle = t.match_sigmas * np.sqrt(new.cov[:, 1, 1] + old.cov[:, 1, 1])
+    same_direction = np.abs(turn) < np.maximum(t.match_angle, spread_angle)
+
+    ends = np.stack([new.begin, new.end], 1) - old.anchor[:, None]
+    s = dot(ends, old.tangent[:, None])
+    distance = np.abs(dot(ends, old.normal[:, None]) - old.offset[:, None])
+    var = _var_across(old.cov, s) + _var_across(new.cov, new.extent)
+    same_line = (distance < np.maximum(t.match_distance, t.match_sigmas * np.sqrt(var))).all(-1)
+
+    gap = np.maximum(s.min(-1) - old.extent[:, 1], old.extent[:, 0] - s.max(-1))
+    return Gates(
+        sign=sign,
+        residual=residual,
+        lever=lever,
+        nis=nis,
+        gap=gap,
+        geometric=same_direction & same_line & (gap < t.match_gap) & new.valid & old.valid,
+        statistical=nis < t.match_nis,
+    )
+
+
+def signed_cov(cov: np.ndarray, sign: Any) -> np.ndarray:
+    """The covariance of (sign offset, angle). Shape `[..., 2, 2]`."""
+    sign = np.asarray(sign, float)
+    one = np.ones_like(sign)
+    return cov * np.stack([np.stack([one, sign], -1), np.stack([sign, one], -1)], -2)
+
+
+def _var_across(cov: np.ndarray, s: np.ndarray) -> np.ndarray:
+    """Variance across the line at `s` along it: with the tangent at +90 degrees a point moves by dh - s dtheta."""
+    return cov[:, None, 0, 0] - 2 * s * cov[:, None, 0, 1] + s**2 * cov[:, None, 1, 1]
+
+
+class Match(NamedTuple):
+    """What the map says of one new line."""
+
+    slot: int  # -1: none
+    suspect: int  # the line that it may be but for the statistical gate, -1: none
+    nis: float
+    dof: int
+
+
+def match_line(new: Lines, lines: Lines, *, thresholds: Any) -> Match:
+    """The line of the map that one new line (of length 1) is."""
+    slots = np.flatnonzero(lines.valid)
+    if not len(slots):
+        return Match(-1, -1, 0.0, 0)
+    g = gates(new, lines.take(slots), thresholds=thresholds)
+    if not g.geometric.any():
+        return Match(-1, -1, 0.0, 0)
+    # The statistical gate is one threshold on the same number: the least NIS is the match or nothing is.
+    best = int(np.argmin(np.where(g.geometric, g.nis, np.inf)))
+    slot = int(slots[best])
+    matched = bool(g.statistical[best])
+    return Match(slot if matched else -1, -1 if matched else slot, float(g.nis[best]), 2)
+
+
+def group_new(found: Extraction, unmatched: list[int], *, thresholds: Any, rules: Any) -> dict[int, list[int]]:
+    """New lines that are no line of the map, with those that continue them: root -> pieces, the root first."""
+    cov = found.cov_measurement if rules.share_pose else found.lines.cov
+    lines = dataclasses.replace(found.lines, cov=cov)
+    groups: dict[int, list[int]] = {}
+    for i in unmatched:
+        roots = list(groups)
+        if roots:
+            g = gates(lines.take(i), lines.take(roots), thresholds=thresholds)
+            good = g.geometric & g.statistical
+            if good.any():
+                groups[roots[int(np.argmin(np.where(good, g.nis, np.inf)))]].append(i)
+                continue
+        groups[i] = [i]
+    return groups
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Fusion of lines
+
+
+class Pieces(NamedTuple):
+    """Observations of one line: `cov` is independent from piece to piece, the pose error behind `jac_pose` common."""
+
+    lines: Lines  # [n]
+    cov: np.ndarray  # [n, 2, 2]
+    jac_pose: np.ndarray  # [n, 2, 3]
+
+
+def pieces_of(found: Extraction, index: list[int], *, rules: Any) -> Pieces:
+    """The new lines at `index` as observations."""
+    if rules.share_pose:
+        return Pieces(found.lines.take(index), found.cov_measurement[index], found.jac_line_pose[index])
+    return Pieces(found.lines.take(index), found.lines.cov[index], np.zeros((len(index), 2, 3)))
+
+
+def fuse(
+    target: Lines, pieces: Pieces, cov_pose: np.ndarray, *, prior: bool, thresholds: Any
+) -> tuple[float, float, np.ndarray]:
+    """The static Kalman filter of Eq. (23), in information form, at the anchor of the target.
+
+    Args:
+      target: the line (of length 1) that is improved; where the equations are linearised.
+      pieces: what was seen of it.
+      cov_pose: covariance of the pose that all pieces share. Shape `[3, 3]`.
+      prior: whether the target's own covariance counts, or it is only one of the pieces.
+      thresholds: for the gates, which yield the residuals.
+
+    Returns:
+      Offset, angle and covariance, at the target's anchor.
+    """
+    g = gates(pieces.lines, target, thresholds=thresholds)
+    s_all = lever_matrix(g.lever)
+    weight, moment, moment_pose = np.zeros((2, 2)), np.zeros(2), np.zeros((2, 3))
+    for s, sign, residual, cov, jac in zip(s_all, g.sign, g.residual, pieces.cov, pieces.jac_pose, strict=True):
+        gain = s.T @ np.linalg.inv(signed_cov(cov, sign))
+        weight += gain @ s
+        moment += gain @ residual
+        moment_pose += gain @ (jac * np.array([[sign], [1.0]]))
+    m = np.linalg.inv(weight)
+    delta = m @ moment
+    cov = symmetric(m + sandwich(m @ moment_pose, cov_pose))
+    if prior:
+        information = np.linalg.inv(cov)
+        cov = symmetric(np.linalg.inv(np.linalg.inv(target.cov[0]) + information))
+        delta = cov @ information @ delta
+    return float(target.offset[0] + delta[0]), float(wrap(target.angle[0] + delta[1])), cov
+
+
+def seen_extent(anchor: np.ndarray, angle: float, pieces: Lines) -> tuple[np.ndarray, np.ndarray]:
+    """The outermost end points of the pieces along a tangent, and their variances. Shapes `[2]`, `[2]`."""
+    tangent = np.array([-math.sin(angle), math.cos(angle)])
+    s = (np.concatenate([pieces.begin, pieces.end]) - anchor) @ tangent
+    var = np.concatenate([pieces.var_extent[:, 0], pieces.var_extent[:, 1]])
+    lo, hi = int(np.argmin(s)), int(np.argmax(s))
+    return s[[lo, hi]], var[[lo, hi]]
+
+
+def fuse_extent(
+    extent: np.ndarray, var: np.ndarray, seen: np.ndarray, var_seen: np.ndarray, *, estimate: bool, sigmas: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """The end points after matching, s5.1.2.
+
+    Args:
+      extent: begin and end so far, m. Shape `[2]`.
+      var: their variances. Shape `[2]`.
+      seen: begin and end that were seen. Shape `[2]`.
+      var_seen: their variances. Shape `[2]`.
+      estimate: average ends that agree; otherwise the line can only become longer, as in the paper.
+      sigmas: how far ends may lie apart to agree.
+
+    Returns:
+      The new extent and its variances.
+    """
+    extent, var = extent.copy(), var.copy()
+    for side, outward in ((0, -1.0), (1, 1.0)):
+        x, v_x, e, v_e = seen[side], var_seen[side], extent[side], var[side]
+        beyond = outward * (x - e)
+        band = sigmas * math.sqrt(v_x + v_e) if estimate else 0.0
+        if beyond > band:
+            extent[side], var[side] = x, v_x
+        elif estimate and beyond >= -band:
+            extent[side], var[side] = (e * v_x + x * v_e) / (v_x + v_e), v_x * v_e / (v_x + v_e)
+    return extent, var
+
+
+def _fuse_into(lines: Lines, slot: int, pieces: Pieces, cov_pose: np.ndarray, *, thresholds: Any, rules: Any) -> None:
+    """Improve the line in a slot by what was seen of it."""
+    offset, angle, cov = fuse(lines.take(slot), pieces, cov_pose, prior=True, thresholds=thresholds)
+    seen, var_seen = seen_extent(lines.anchor[slot], angle, pieces.lines)
+    extent, var_extent = fuse_extent(
+        lines.extent[slot],
+        lines.var_extent[slot],
+        seen,
+        var_seen,
+        estimate=rules.estimate_ends,
+        sigmas=float(thresholds.end_sigmas),
+    )
+    _put(lines, slot, offset=offset, angle=angle, cov=cov, extent=extent, var_extent=var_extent)
+    lines.times_detected[slot] += 1
+
+
+def _add(lines: Lines, slot: int, pieces: Pieces, cov: np.ndarray, cov_pose: np.ndarray, *, thresholds: Any) -> None:
+    """Put a new line into a free slot; its first piece is the root, which has the covariance `cov`."""
+    root = dataclasses.replace(pieces.lines.take(0), cov=cov[None])
+    offset, angle, cov = fuse(root, pieces, cov_pose, prior=False, thresholds=thresholds)
+    extent, var_extent = seen_extent(root.anchor[0], angle, pieces.lines)
+    _put(lines, slot, anchor=root.anchor[0], offset=offset, angle=angle, cov=cov, extent=extent, var_extent=var_extent)
+    _put(lines, slot, times_detected=1, valid=True)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Merging
+
+
+def _merge(lines: Lines, targets: np.ndarray, *, thresholds: Any) -> dict[int, int]:
+    """Join lines of the map that this scan has shown to be one. Returns the freed slots and where each went."""
+    candidates: list[tuple[float, int, int, int]] = []  # NIS, new line, lower slot, higher slot
+    for i, g in enumerate(targets):
+        others = np.flatnonzero(lines.valid)
+        others = others[others != g]
+        if g < 0 or g in targets[:i] or not len(others):
+            continue
+        low, high = np.minimum(g, others), np.maximum(g, others)
+        pairs = gates(lines.take(high), lines.take(low), thresholds=thresholds)
+        good = pairs.geometric & pairs.statistical & (pairs.gap < 0)
+        if good.any():
+            best = int(np.argmin(np.where(good, pairs.nis, np.inf)))
+            candidates.append((float(pairs.nis[best]), i, int(low[best]), int(high[best])))
+
+    freed: dict[int, int] = {}
+    for candidate in candidates:
+        _, _, low, high = candidate
+        # Equal pairs, found from both sides, differ in the new line: tuples compare by NIS, then by that.
+        if all(candidate[:2] <= c[:2] for c in candidates if {low, high} & set(c[2:])):
+            freed[high] = low
+    for high, low in freed.items():
+        piece = Pieces(lines.take(high), lines.cov[[high]], np.zeros((1, 2, 3)))
+        offset, angle, cov = fuse(lines.take(low), piece, np.zeros((3, 3)), prior=True, thresholds=thresholds)
+        seen, var_seen = seen_extent(lines.anchor[low], angle, piece.lines)
+        extent, var = fuse_extent(lines.extent[low], lines.var_extent[low], seen, var_seen, estimate=False, sigmas=0.0)
+        _put(lines, low, offset=offset, angle=angle, cov=cov, extent=extent, var_extent=var)
+        lines.times_detected[low] = max(lines.times_detected[low], lines.times_detected[high])
+        _free(lines, high)
+    return freed
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Wiping
+
+
+Cuts = dict[int, list[tuple[float, float]]]
+"""For slots of lines: the intervals along the tangent that are to go."""
+
+
+def beam_cuts(lines: Lines, sweep: Sweep, found: Extraction, own: np.ndarray, *, thresholds: Any) -> Cuts:
+    """What the beams of a scan have passed through, in place of the wipe triangle of s6.2.
+
+    Args:
+      lines: lines of the map.
+      sweep: the valid beams.
+      found: what was extracted from them.
+      own: for each new line the slot of the line that it was taken for, -1 for none. Shape `[n]`.
+      thresholds: the margins.
+
+    Returns:
+      The cuts.
+    """
+    t = _numbers(thresholds)
+    slots = np.flatnonzero(lines.valid)
+    if not len(slots) or len(sweep.r) < 2:
+        return {}
+    old = lines.take(slots)
+    label = found.line_of_beam[sweep.beam]
+    slot_of_beam = np.where(label >= 0, np.append(own, -1)[label], -1)
+
+    # Where each beam would meet each line. A beam along a line meets it nowhere.
+    apex = sweep.p + sweep.laser
+    across = old.normal @ sweep.u.T  # [J, n]
+    crossing = np.abs(across) >= PARALLEL
+    far = np.where(
+        crossing, (old.offset - dot(old.normal, apex - old.anchor))[:, None] / np.where(crossing, across, 1), -1.0
+    )
+    s = dot(old.tangent, apex - old.anchor)[:, None] + far * (old.tangent @ sweep.u.T)
+    meets = (far > 0) & (old.extent[:, :1] < s) & (s < old.extent[:, 1:]) & (slot_of_beam != slots[:, None])
+
+    # The rest only for the pairs that do meet, of which there are few.
+    j, i = np.nonzero(meets)
+    den, r_line, along = across[j, i], far[j, i], s[j, i]
+    normal, tangent, u, cov = old.normal[j], old.tangent[j], sweep.u[i], old.cov[j]
+    row = (normal[:, None] @ jac_point_pose(sweep.laser + r_line[:, None] * u))[:, 0]
+    var_line = cov[:, 0, 0] - 2 * along * cov[:, 0, 1] + along**2 * cov[:, 1, 1]
+    var = var_line + dot(row @ sweep.cov_pose, row) + r_line**2 * sweep.sa**2 * dot(tangent, u) ** 2
+    margin = np.maximum(t.wipe_sigmas * np.sqrt(sweep.sr**2 + var / den**2), t.match_distance / np.abs(den))
+    # A beam that ended on an extracted line reaches a little behind that line.
+    height = np.abs(dot(found.lines.normal, apex - found.lines.anchor) - found.lines.offset)
+    stretch = np.where(height < EDGE_ON, 0.0, 1 + t.wipe_extension / np.maximum(height, EDGE_ON))
+    reach = np.maximum(sweep.r[i] - margin, sweep.r[i] * np.append(stretch, 0.0)[label[i]])
+    passed = np.zeros(meets.shape, bool)
+    passed[j, i] = r_line < reach
+
+    neighbours = np.abs(np.diff(sweep.bearing)) < t.gap_beams * sweep.spacing
+    cuts: Cuts = {}
+    for j, i in np.argwhere(passed[:, :-1] & passed[:, 1:] & neighbours):
+        a, b = sorted((float(s[j, i]), float(s[j, i + 1])))
+        cuts.setdefault(int(slots[j]), []).append((a, b))
+    return cuts
+
+
+def wipe_triangle(line: Lines, apex: np.ndarray, *, thresholds: Any) -> np.ndarray | None:
+    """The triangle of s6.2 over one line (of length 1), counter-clockwise; None if it is seen edge on. `[3, 2]`."""
+    height = abs(float(dot(line.normal[0], apex - line.anchor[0]) - line.offset[0]))
+    if height < EDGE_ON:
+        return None
+    stretch = 1 + float(thresholds.wipe_extension) / height
+    a, b = (apex + stretch * (end[0] - apex) for end in (line.begin, line.end))
+    return np.stack([apex, a, b] if perp(a - apex) @ (b - apex) > 0 else [apex, b, a])
+
+
+def triangle_cuts(lines: Lines, triangle: np.ndarray, spare: int) -> Cuts:
+    """The part of each line that lies inside the open triangle, but for the line in the slot `spare`."""
+    cuts: Cuts = {}
+    foot = lines.point_at(np.zeros(len(lines.offset)))
+    for slot in np.flatnonzero(lines.valid):
+        if slot == spare:
+            continue
+        lo, hi = lines.extent[slot]
+        for k in range(3):
+            # Inside of an edge: at + rate * s > 0, along the line.
+            inward = perp(triangle[(k + 1) % 3] - triangle[k])
+            at, rate = inward @ (foot[slot] - triangle[k]), inward @ lines.tangent[slot]
+            if rate > 0:
+                lo = max(lo, -at / rate)
+            elif rate < 0:
+                hi = min(hi, -at / rate)
+            elif at <= 0:
+                hi = lo
+        if hi > lo:
+            cuts[int(slot)] = [(float(lo), float(hi))]
+    return cuts
+
+
+def remaining(extent: np.ndarray, cuts: list[tuple[float, float]], shortest: float) -> list[tuple[float, float]]:
+    """The pieces of an interval that the cuts leave and that are not too short, in ascending order."""
+    pieces = []
+    start = float(extent[0])
+    for a, b in sorted(cuts):
+        pieces.append((start, a))
+        start = max(start, b)
+    pieces.append((start, float(extent[1])))
+    return [(a, b) for a, b in pieces if b > a and b - a >= shortest]
+
+
+def _cut(lines: Lines, cuts: Cuts, report: Report, *, thresholds: Any) -> list[int]:
+    """Delete, trim and split lines, s6.3. Returns the slots of the deleted ones."""
+    deleted = []
+    for slot in sorted(cuts):
+        old = lines.take(slot)
+        pieces = remaining(old.extent[0], cuts[slot], float(thresholds.min_length))
+        _free(lines, slot)
+        if not pieces:
+            report.deleted += 1
+            deleted.append(slot)
+        elif len(pieces) == 1:
+            report.trimmed += 1
+        else:
+            report.split += 1
+        for k, (a, b) in enumerate(pieces):
+            free = slot if k == 0 else _lowest_free(lines)
+            if free is None:
+                report.status |= Status.MAP_LINES_FULL
+                break
+            _put(lines, free, **_piece(old, a, b))
+    return deleted
+
+
+def _piece(line: Lines, a: float, b: float) -> dict[str, Any]:
+    """The part of a line (of length 1) from `a` to `b` along it, anchored in its middle."""
+    anchor = line.point_at(np.array([(a + b) / 2]))[0]
+    normal, tangent = line.normal[0], line.tangent[0]
+    shift = line.anchor[0] - anchor
+    return {
+        "anchor": anchor,
+        "offset": line.offset[0] + normal @ shift,
+        "angle": line.angle[0],
+        "cov": symmetric(sandwich(lever_matrix(tangent @ shift), line.cov[0])),
+        "extent": np.array([a, b]) + tangent @ shift,
+        "var_extent": line.var_extent[0],
+        "times_detected": line.times_detected[0],
+        "valid": True,
+    }
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Circles of the map
+
+
+def _circle_state(circles: Circles, i: int) -> np.ndarray:
+    """(x, y, radius) of one circle."""
+    return np.array([*circles.center[i], circles.radius[i]])
+
+
+def match_circle(circles: Circles, found: Circles, i: int, *, thresholds: Any, rules: Any) -> tuple[Match, float]:
+    """The circle of the map that new circle `i` is, s5.2.1, and how far apart their centres are.
+
+    `suspect` is the nearest circle where the distance would do, but the covariances forbid it.
+    """
+    t = _numbers(thresholds)
+    distance = np.hypot(*(found.center[i] - circles.center).T)
+    near = np.flatnonzero(circles.valid & (distance < t.circle_match_distance))
+    near = near[np.argsort(distance[near], kind="stable")]
+    if not len(near):
+        return Match(-1, -1, 0.0, 0), math.inf
+    nis = {}
+    for j in near:
+        if found.fitted[i] and circles.fitted[j]:
+            d = _circle_state(found, i) - _circle_state(circles, j)
+            nis[j] = float(d @ np.linalg.solve(found.cov[i] + circles.cov[j], d))
+    first = int(near[0])
+    shown = (nis[first], 3) if first in nis else (0.0, 0)
+    for j in near:
+        if not (rules.weigh_circles and j in nis) or nis[j] < t.circle_match_nis:
+            return Match(int(j), -1, *shown), float(distance[j])
+    return Match(-1, first, *shown), math.inf
+
+
+def _wiped_by_beams(circles: Circles, slot: int, sweep: Sweep, *, thresholds: Any) -> bool:
+    """Whether beams have passed through the place of a circle, and none has ended at it or before it."""
+    sigmas = float(thresholds.wipe_sigmas)
+    radius = circles.radius[slot]
+    o = circles.center[slot] - sweep.p
+    c = o - sweep.laser
+    rc = math.hypot(*c)
+    along, across = sweep.u @ c, sweep.u[:, 0] * c[1] - sweep.u[:, 1] * c[0]
+    if rc == 0.0 or 2 * radius < sweep.spacing * rc:
+        return False
+    u = c / rc
+    cov = sandwich(jac_point_pose(o), sweep.cov_pose)
+    width = radius + sigmas * math.sqrt(perp(u) @ cov @ perp(u) + rc**2 * sweep.sa**2)
+    depth = radius + sigmas * math.sqrt(sweep.sr**2 + u @ cov @ u)
+    evidence = (np.abs(across) < width) & (along > 0)
+    return bool(evidence.sum() >= 2 and (sweep.r[evidence] > along[evidence] + depth).all())
+
+
+def _inside(point: np.ndarray, triangle: np.ndarray) -> bool:
+    return all(perp(triangle[(k + 1) % 3] - triangle[k]) @ (point - triangle[k]) > 0 for k in range(3))
+
+
+def _fuse_circle(circles: Circles, slot: int, found: Circles, members: list[int], *, rules: Any) -> None:
+    """Improve a circle by the new ones that are it; `members` are in order of distance. Eqs. (24)-(25) or better."""
+    old = _circle_state(circles, slot)
+    mean = np.mean([_circle_state(found, i) for i in members], axis=0)
+    fitted = [i for i in members if found.fitted[i]]
+    state, cov, is_fitted = old, circles.cov[slot], bool(circles.fitted[slot])
+    if not rules.weigh_circles:
+        state = (mean + old) / 2
+    elif fitted and is_fitted:
+        new = fitted[0]
+        prior, information = np.linalg.inv(cov), np.linalg.inv(found.cov[new])
+        cov = symmetric(np.linalg.inv(prior + information))
+        state = old + cov @ information @ (_circle_state(found, new) - old)
+    elif fitted:
+        state, cov, is_fitted = _circle_state(found, fitted[0]), found.cov[fitted[0]], True
+    elif not is_fitted:
+        state = old + (mean - old) / (circles.times_detected[slot] + 1)
+    _put(circles, slot, center=state[:2], radius=state[2], cov=cov, fitted=is_fitted)
+    circles.times_detected[slot] += 1
+
+
+def _update_circles(
+    new_map: OracleMap,
+    found: Extraction,
+    sweep: Sweep,
+    targets: np.ndarray,
+    triangles: list[np.ndarray],
+    report: Report,
+    *,
+    thresholds: Any,
+    rules: Any,
+) -> None:
+    """The circles of the scan into the map, after its lines."""
+    lines, circles, new = new_map.lines, new_map.circles, found.circles
+    reach = float(thresholds.circle_line_distance)
+
+    members: dict[int, list[tuple[float, int]]] = {}
+    added = []
+    for i in range(len(new.radius)):
+        match, distance = match_circle(circles, new, i, thresholds=thresholds, rules=rules)
+        report.circle_nis[i], report.circle_dof[i] = match.nis, match.dof
+        if match.slot >= 0:
+            report.circle_slot[i] = match.slot
+            members.setdefault(match.slot, []).append((distance, i))
+        elif match.suspect < 0 or not rules.leave_out_ambiguous:
+            added.append(i)
+
+    # What is about to be fused was seen, and is spared.
+    for slot in np.flatnonzero(circles.valid):
+        if slot in members:
+            continue
+        if rules.wipe_by_beams:
+            gone = _wiped_by_beams(circles, slot, sweep, thresholds=thresholds)
+        else:
+            gone = any(_inside(circles.center[slot], triangle) for triangle in triangles)
+        if gone:
+            _free(circles, slot)
+            report.deleted += 1
+
+    for slot, assigned in members.items():
+        _fuse_circle(circles, slot, new, [i for _, i in sorted(assigned)], rules=rules)
+        report.fused += 1
+
+    on_map = lines.take(np.flatnonzero(lines.valid))
+    for i in added:
+        if (distance_to_segments(new.center[i], on_map) < reach).any():
+            continue
+        slot = _lowest_free(circles)
+        if slot is None:
+            report.status |= Status.MAP_CIRCLES_FULL
+            continue
+        fields = ("center", "radius", "cov", "fitted")
+        _put(circles, slot, times_detected=1, valid=True, **{name: getattr(new, name)[i] for name in fields})
+        report.circle_slot[i] = NEW
+        report.added += 1
+
+    seen = lines.take([slot for slot in set(targets.tolist()) if slot >= 0 and lines.valid[slot]])
+    for slot in np.flatnonzero(circles.valid):
+        if (distance_to_segments(circles.center[slot], seen) < reach).any():
+            _free(circles, slot)
+            report.deleted += 1
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The update
+
+
+def update(
+    line_map: OracleMap,
+    scan: tuple[np.ndarray, np.ndarray, np.ndarray, float],
+    pose_mean: np.ndarray,
+    pose_cov: np.ndarray,
+    *,
+    thresholds: Any,
+    noise: Any,
+    mount: Any,
+    rules: Any,
+    covariance: Literal["exact", "printed"],
+    scan_capacity: Any,
+    mode: Literal["simultaneous", "sequential"] = "simultaneous",
+) -> tuple[OracleMap, Report]:
+    """One scan into the map.
+
+    Args:
+      line_map: the map so far; it is left as it is.
+      scan: ranges, bearings, valid, spacing, as for `extract`.
+      pose_mean: pose of the robot in the world. Shape `[3]`.
+      pose_cov: its covariance. Shape `[3, 3]`.
+      thresholds: a `settings.Thresholds`.
+      noise: a `settings.SensorNoise`.
+      mount: a `settings.Mount`.
+      rules: a `settings.Rules`.
+      covariance: `exact`, or Eq. (12) as `printed`.
+      scan_capacity: a `settings.Capacity`: how much of one scan is kept.
+      mode: `simultaneous`: all lines of the scan are held against the map as it stood. `sequential`, the order of the
+        paper: line by line, each against what the one before has left.
+
+    Returns:
+      The new map and the report.
+    """
+    found = extract(
+        *scan,
+        pose_mean,
+        pose_cov,
+        thresholds=thresholds,
+        noise=noise,
+        mount=mount,
+        rules=rules,
+        covariance=covariance,
+        capacity=scan_capacity,
+    )
+    n, m = len(found.lines.offset), len(found.circles.radius)
+    report = Report(
+        line_slot=np.full(n, LEFT_OUT),
+        line_nis=np.zeros(n),
+        line_dof=np.zeros(n, int),
+        circle_slot=np.full(m, LEFT_OUT),
+        circle_nis=np.zeros(m),
+        circle_dof=np.zeros(m, int),
+        status=found.status,
+    )
+    new_map = OracleMap(lines=_copy(line_map.lines), circles=_copy(line_map.circles))
+    if found.status & Status.POSE_NOT_FINITE:
+        return new_map, report
+    sweep = sweep_of(*scan, pose_mean, pose_cov, noise=noise, mount=mount)
+    apex = sweep.p + sweep.laser
+    lines = new_map.lines
+
+    into = _lines_one_by_one if mode == "sequential" else _lines_at_once
+    targets, suspects, triangles = into(lines, found, sweep, report, thresholds=thresholds, rules=rules)
+
+    if rules.merge:
+        freed = _merge(lines, targets, thresholds=thresholds)
+        report.merged += len(freed)
+        for slots in (targets, suspects, report.line_slot):
+            slots[:] = [freed.get(slot, slot) for slot in slots.tolist()]
+
+    if rules.wipe_by_beams:
+        own = np.where(targets >= 0, targets, suspects)
+        _cut(lines, beam_cuts(lines, sweep, found, own, thresholds=thresholds), report, thresholds=thresholds)
+    elif mode == "simultaneous":
+        cuts: Cuts = {}
+        for slot in sorted({slot for slot in targets.tolist() if slot >= 0}):
+            triangle = wipe_triangle(lines.take(slot), apex, thresholds=thresholds)
+            if triangle is None:
+                continue
+            triangles.append(triangle)
+            for j, intervals in triangle_cuts(lines, triangle, spare=slot).items():
+                cuts.setdefault(j, []).extend(intervals)
+        _cut(lines, cuts, report, thresholds=thresholds)
+
+    _update_circles(new_map, found, sweep, targets, triangles, report, thresholds=thresholds, rules=rules)
+    report.status = int(report.status)
+    return new_map, report
+
+
+def _lines_at_once(
+    lines: Lines, found: Extraction, sweep: Sweep, report: Report, *, thresholds: Any, rules: Any
+) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+    """Match all new lines against the map as it stood, then fuse and add.
+
+    Returns:
+      For each new line the slot that it went into and the slot that it was suspected to be (-1: none), and no
+      triangles: they are drawn later.
+    """
+    n = len(found.lines.offset)
+    targets, suspects = np.full(n, -1), np.full(n, -1)
+    pieces: dict[int, list[int]] = {}
+    unmatched = []
+    for i in range(n):
+        match = match_line(found.lines.take(i), lines, thresholds=thresholds)
+        report.line_nis[i], report.line_dof[i] = match.nis, match.dof
+        if match.slot >= 0:
+            targets[i] = report.line_slot[i] = match.slot
+            pieces.setdefault(match.slot, []).append(i)
+        elif match.suspect >= 0 and rules.leave_out_ambiguous:
+            suspects[i] = match.suspect
+        else:
+            unmatched.append(i)
+
+    groups = group_new(found, unmatched, thresholds=thresholds, rules=rules)
+    for slot, index in pieces.items():
+        seen = pieces_of(found, index, rules=rules)
+        _fuse_into(lines, slot, seen, sweep.cov_pose, thresholds=thresholds, rules=rules)
+        report.fused += 1
+    for root, index in groups.items():
+        slot = _lowest_free(lines)
+        if slot is None:
+            report.status |= Status.MAP_LINES_FULL
+            continue
+        seen = pieces_of(found, index, rules=rules)
+        _add(lines, slot, seen, found.lines.cov[root], sweep.cov_pose, thresholds=thresholds)
+        targets[index], report.line_slot[index] = slot, NEW
+        report.added += 1
+    return targets, suspects, []
+
+
+def _lines_one_by_one(
+    lines: Lines, found: Extraction, sweep: Sweep, report: Report, *, thresholds: Any, rules: Any
+) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+    """The order of the paper: each new line is matched, fused or added, and wipes, before the next one.
+
+    Returns:
+      For each new line the slot that it went into and the slot that it was suspected to be (-1: none, or that line is
+      gone again), and the triangles that have wiped.
+    """
+    n = len(found.lines.offset)
+    targets, suspects = np.full(n, -1), np.full(n, -1)
+    triangles: list[np.ndarray] = []
+    for i in range(n):
+        match = match_line(found.lines.take(i), lines, thresholds=thresholds)
+        report.line_nis[i], report.line_dof[i] = match.nis, match.dof
+        seen = pieces_of(found, [i], rules=rules)
+        if match.slot >= 0:
+            _fuse_into(lines, match.slot, seen, sweep.cov_pose, thresholds=thresholds, rules=rules)
+            targets[i] = report.line_slot[i] = match.slot
+            report.fused += 1
+        elif match.suspect >= 0 and rules.leave_out_ambiguous:
+            suspects[i] = match.suspect
+            continue
+        else:
+            slot = _lowest_free(lines)
+            if slot is None:
+                report.status |= Status.MAP_LINES_FULL
+                continue
+            _add(lines, slot, seen, found.lines.cov[i], sweep.cov_pose, thresholds=thresholds)
+            targets[i], report.line_slot[i] = slot, NEW
+            report.added += 1
+        if rules.wipe_by_beams:
+            continue
+        triangle = wipe_triangle(lines.take(targets[i]), sweep.p + sweep.laser, thresholds=thresholds)
+        if triangle is None:
+            continue
+        triangles.append(triangle)
+        cuts = triangle_cuts(lines, triangle, spare=int(targets[i]))
+        for slot in _cut(lines, cuts, report, thresholds=thresholds):
+            # Its slot may go to another line, which these new lines never were.
+            targets[targets == slot] = -1
+            suspects[suspects == slot] = -1
+    return targets, suspects, triangles
