@@ -1098,25 +1098,20 @@ def wipe_triangle(line: Lines, apex: np.ndarray, *, thresholds: Any) -> np.ndarr
 
 def triangle_cuts(lines: Lines, triangle: np.ndarray, spare: int) -> Cuts:
     """The part of each line that lies inside the open triangle, but for the line in the slot `spare`."""
-    cuts: Cuts = {}
-    foot = lines.point_at(np.zeros(len(lines.offset)))
-    for slot in np.flatnonzero(lines.valid):
-        if slot == spare:
-            continue
-        lo, hi = lines.extent[slot]
-        for k in range(3):
-            # Inside of an edge: at + rate * s > 0, along the line.
-            inward = perp(triangle[(k + 1) % 3] - triangle[k])
-            at, rate = inward @ (foot[slot] - triangle[k]), inward @ lines.tangent[slot]
-            if rate > 0:
-                lo = max(lo, -at / rate)
-            elif rate < 0:
-                hi = min(hi, -at / rate)
-            elif at <= 0:
-                hi = lo
-        if hi > lo:
-            cuts[int(slot)] = [(float(lo), float(hi))]
-    return cuts
+    slots = np.flatnonzero(lines.valid)
+    slots = slots[slots != spare]
+    old = lines.take(slots)
+    foot, tangent = old.point_at(np.zeros(len(slots))), old.tangent
+    lo, hi = old.extent.T.copy()
+    for k in range(3):
+        # Inside of an edge: at + rate * s > 0, along the line.
+        inward = perp(triangle[(k + 1) % 3] - triangle[k])
+        at, rate = (foot - triangle[k]) @ inward, tangent @ inward
+        bound = -at / np.where(rate == 0, 1.0, rate)
+        lo = np.where(rate > 0, np.maximum(lo, bound), lo)
+        hi = np.where(rate < 0, np.minimum(hi, bound), hi)
+        hi = np.where((rate == 0) & (at <= 0), lo, hi)
+    return {int(slots[j]): [(float(lo[j]), float(hi[j]))] for j in np.flatnonzero(hi > lo)}
 
 
 def remaining(extent: np.ndarray, cuts: list[tuple[float, float]], shortest: float) -> list[tuple[float, float]]:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from linemap_jax.core.frames import dot, perp
 from linemap_jax.core.lines import Runs, runs_from_labels
-from linemap_jax.core.propagation import inverse, propagate
+from linemap_jax.core.propagation import apply, inverse, propagate
 from linemap_jax.core.sensor import Points
 from linemap_jax.core.settings import SensorNoise, Thresholds
 from linemap_jax.core.state import Circles, Lines, Pose, Scan
@@ -186,7 +186,7 @@ def _fit_circles(
     def step(_: int, circle: Array) -> Array:
         residual, _, rows, normal_matrix = linearise(circle)
         gradient = clusters.sum(rows * residual[:, None])
-        return circle - jnp.einsum("kij,kj->ki", inverse(normal_matrix), gradient)
+        return circle - apply(inverse(normal_matrix), gradient)
 
     circle = jax.lax.fori_loop(0, GAUSS_NEWTON_STEPS, step, circle)
     residual, e, rows, normal_matrix = linearise(circle)

@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from linemap_jax.core.frames import dot, wrap_angle
+from linemap_jax.core.frames import dot, shift_matrix, wrap_angle
 from linemap_jax.core.matching import CircleMatches, compare_lines, with_sign
-from linemap_jax.core.propagation import inverse, propagate, symmetric
+from linemap_jax.core.propagation import apply, inverse, product, propagate, symmetric
 from linemap_jax.core.settings import Rules, Thresholds
 from linemap_jax.core.state import Circles, Lines, pytree
 
@@ -59,9 +59,11 @@ def fuse_lines(
     def in_map(piece: Lines, line: Lines, cov: Array, jac: Array) -> tuple[Array, Array, Array]:
         """Information of one piece about its line, at the line's anchor: matrix, vector, and what the pose adds."""
         pair = compare_lines(piece, line, thresholds)
-        weight = pair.shift.T @ inverse(with_sign(cov, pair.sign))
+        shift = shift_matrix(pair.lever)
+        weight = product(shift.T, inverse(with_sign(cov, pair.sign)))
         turned = jac * jnp.stack([pair.sign, jnp.ones_like(pair.sign)])[:, None]
-        return weight @ pair.shift, weight @ pair.innovation, weight @ turned
+        innovation = jnp.stack([pair.offset, pair.angle])
+        return product(weight, shift), apply(weight, innovation), product(weight, turned)
 
     mine = jax.tree.map(lambda x: x[at], model)
     parts = jax.vmap(in_map)(pieces.lines, mine, pieces.cov_measurement, pieces.jac_line_pose)
@@ -69,12 +71,12 @@ def fuse_lines(
     touched = total(jnp.ones_like(into)) > 0
 
     cov_measurement = inverse(information)
-    seen = jnp.einsum("kij,kj->ki", cov_measurement, vector)
-    cov_seen = cov_measurement + propagate(cov_measurement @ by_pose, cov_pose)
+    seen = apply(cov_measurement, vector)
+    cov_seen = cov_measurement + propagate(product(cov_measurement, by_pose), cov_pose)
     information_seen = inverse(cov_seen)
     prior = jnp.where(has_prior[:, None, None], inverse(model.cov), 0)
     cov = symmetric(inverse(prior + information_seen))
-    change = jnp.einsum("kij,kjl,kl->ki", cov, information_seen, seen)
+    change = apply(cov, apply(information_seen, seen))
 
     fused = dataclasses.replace(
         model,
@@ -168,7 +170,7 @@ def fuse_circles(model: Circles, new: Circles, matches: CircleMatches, rules: Ru
         prior = inverse(jnp.where(both[:, None, None], model.cov, eye))
         gain = inverse(jnp.where(both[:, None, None], cov_seen, eye))
         cov_both = symmetric(inverse(prior + gain))
-        joint = old + jnp.einsum("kij,kjl,kl->ki", cov_both, gain, seen - old)
+        joint = old + apply(cov_both, apply(gain, seen - old))
 
         fused = jnp.where(
             both[:, None],

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from linemap_jax.core.frames import dot, perp, shift_matrix, wrap_angle
-from linemap_jax.core.propagation import propagate, symmetric
+from linemap_jax.core.propagation import product, propagate, quadratic, symmetric
 from linemap_jax.core.sensor import Points, cov_point
 from linemap_jax.core.settings import Covariance, Jacobians, SensorNoise, Thresholds
 from linemap_jax.core.state import Lines, Pose, Scan, neutral_where_free, pytree
@@ -144,7 +144,7 @@ def jac_line_points(
         fit = regress(position, runs)
         jac = jac_regression_points(position, runs, fit, anchor)
         in_run = (runs.of_beam >= 0)[:, None, None]
-        return jnp.where(in_run, runs.spread(jac_line_regression(fit, anchor)) @ jac, 0)
+        return jnp.where(in_run, product(runs.spread(jac_line_regression(fit, anchor)), jac), 0)
     raise ValueError(f"jacobians must be 'autodiff' or 'analytic', not {jacobians!r}")
 
 
@@ -232,9 +232,9 @@ def measure_lines(
 
     jac = jac_line_points(points.position, runs, anchor, jacobians=jacobians)
     sigma = jnp.stack([noise.range_sigma, noise.bearing_sigma])
-    from_noise = (jac @ points.jac_point_measurement) * sigma[None, None]
-    from_pose = jac @ points.jac_point_pose
-    cov_measurement = runs.sum(from_noise @ jnp.swapaxes(from_noise, -1, -2))
+    from_noise = product(jac, points.jac_point_measurement) * sigma[None, None]
+    from_pose = product(jac, points.jac_point_pose)
+    cov_measurement = runs.sum(product(from_noise, jnp.swapaxes(from_noise, -1, -2)))
     if covariance == "exact":
         jac_line_pose = runs.sum(from_pose)
     elif covariance == "printed":
@@ -287,7 +287,7 @@ def _var_extent(
     cov = cov_point(points, pose, noise)
 
     def at(beam: Int[Array, " K"]) -> Float[Array, " K"]:
-        from_point = jnp.einsum("ki,kij,kj->k", tangent, cov[beam], tangent)
+        from_point = quadratic(tangent, cov[beam])
         # A grazing beam says nothing about the end; 0.1 is 6 degrees.
         step = scan.spacing * scan.ranges[beam] / jnp.maximum(jnp.abs(dot(normal, points.beam[beam])), 0.1)
         return from_point + step**2 / 12

@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from linemap_jax.core.frames import dot, shift_matrix, wrap_angle
-from linemap_jax.core.propagation import inverse, propagate, quadratic
+from linemap_jax.core.frames import dot, wrap_angle
+from linemap_jax.core.propagation import inverse, quadratic
 from linemap_jax.core.settings import Rules, Thresholds
 from linemap_jax.core.state import Circles, Lines, pytree
 
@@ -20,8 +20,9 @@ from linemap_jax.core.state import Circles, Lines, pytree
 class LineComparison:
     """A new line held against one of the map."""
 
-    innovation: Float[Array, "2"]  # (m, rad): new minus map, at the anchor of the new line
-    shift: Float[Array, "2 2"]  # S: moves a small change of the map's line to that anchor
+    offset: Float[Array, ""]  # innovation, new minus map, at the anchor of the new line, m
+    angle: Float[Array, ""]  # innovation, rad
+    lever: Float[Array, ""]  # of the shift S that moves a small change of the map's line to that anchor, m
     sign: Float[Array, ""]  # -1 where the new line has to be taken reversed
     nis: Float[Array, ""]  # Eq. (21)
     gap: Float[Array, ""]  # m, along the line; negative where the segments overlap
@@ -39,29 +40,42 @@ def compare_lines(new: Lines, model: Lines, thresholds: Thresholds) -> LineCompa
       thresholds: `match_...`.
     """
     turn = wrap_angle(new.angle - model.angle)
-    reverse = jnp.cos(turn) < 0
+    reverse = jnp.abs(turn) > jnp.pi / 2
     sign = jnp.where(reverse, -1, 1).astype(turn.dtype)
-    turn = jnp.where(reverse, wrap_angle(turn + jnp.pi), turn)
+    turn = jnp.where(reverse, turn - jnp.sign(turn) * jnp.pi, turn)
 
+    # In components, not matrices: this runs for every pair of lines, and must become one kernel.
     step = model.anchor - new.anchor
     normal, tangent = model.normal, model.tangent
-    shift = shift_matrix(dot(tangent, step))
-    innovation = jnp.stack([sign * new.offset - (model.offset + dot(normal, step)), turn])
-    cov_new = with_sign(new.cov, sign)
-    nis = quadratic(innovation, inverse(cov_new + propagate(shift, model.cov)))
+    lever = dot(tangent, step)
+    offset = sign * new.offset - (model.offset + dot(normal, step))
+    var_angle = new.cov[1, 1] + model.cov[1, 1]
+    # S C S^T of the map's line
+    covariance = sign * new.cov[0, 1] + model.cov[0, 1] + lever * model.cov[1, 1]
+    var_offset = new.cov[0, 0] + model.cov[0, 0] + lever * (2 * model.cov[0, 1] + lever * model.cov[1, 1])
+    det = var_offset * var_angle - covariance**2
+    weighted = var_angle * offset**2 - 2 * covariance * offset * turn + var_offset * turn**2
+    nis = weighted / jnp.where(det > 0, det, 1)
 
-    spread = thresholds.match_sigmas * jnp.sqrt(new.cov[1, 1] + model.cov[1, 1])
-    parallel = jnp.abs(turn) < jnp.maximum(thresholds.match_angle, spread)
-
-    ends = jnp.stack([new.point_at(new.extent[0]), new.point_at(new.extent[1])]) - model.anchor[None]
-    along = ends @ tangent
-    across = jnp.abs(ends @ normal - model.offset)
-    variance = normal_variance(model.cov, along) + normal_variance(new.cov, new.extent)
-    near = across < jnp.maximum(thresholds.match_distance, thresholds.match_sigmas * jnp.sqrt(variance))
-
-    gap = jnp.maximum(jnp.min(along) - model.extent[1], model.extent[0] - jnp.max(along))
-    geometric = new.valid & model.valid & parallel & jnp.all(near) & (gap < thresholds.match_gap)
-    return LineComparison(innovation=innovation, shift=shift, sign=sign, nis=nis, gap=gap, geometric=geometric)
+    parallel = jnp.abs(turn) < jnp.maximum(thresholds.match_angle, thresholds.match_sigmas * jnp.sqrt(var_angle))
+    near, along = parallel, []
+    for own, end in ((new.extent[0], new.begin), (new.extent[1], new.end)):
+        from_anchor = end - model.anchor
+        s = dot(tangent, from_anchor)
+        across = jnp.abs(dot(normal, from_anchor) - model.offset)
+        spread = jnp.sqrt(normal_variance(model.cov, s) + normal_variance(new.cov, own))
+        near = near & (across < jnp.maximum(thresholds.match_distance, thresholds.match_sigmas * spread))
+        along.append(s)
+    gap = jnp.maximum(jnp.minimum(*along) - model.extent[1], model.extent[0] - jnp.maximum(*along))
+    return LineComparison(
+        offset=offset,
+        angle=turn,
+        lever=lever,
+        sign=sign,
+        nis=nis,
+        gap=gap,
+        geometric=new.valid & model.valid & near & (gap < thresholds.match_gap),
+    )
 
 
 def compare_all(new: Lines, model: Lines, thresholds: Thresholds) -> LineComparison:
@@ -165,31 +179,27 @@ class CircleMatches:
 def match_circles(new: Circles, model: Circles, thresholds: Thresholds, rules: Rules) -> CircleMatches:
     """Find for each new circle the circle of the map that it is: section 5.2.1.
 
-    The paper's one criterion is the distance of the centres. Fitted circles have a covariance, and by default must pass
-    a chi-square gate on centre and radius too.
+    The nearest is taken. The paper's one criterion is the distance of the centres; fitted circles have a covariance,
+    and by default must pass a chi-square gate on centre and radius too.
     """
 
-    def compare(a: Circles, b: Circles) -> tuple[Array, Array, Array]:
-        step = jnp.concatenate([a.center - b.center, (a.radius - b.radius)[None]])
-        distance = jnp.sqrt(dot(step[:2], step[:2]))
-        both = a.fitted & b.fitted
-        cov = jnp.where(both, a.cov + b.cov, jnp.eye(3, dtype=step.dtype))
-        nis = jnp.where(both, quadratic(step, inverse(cov)), 0)
-        near = a.valid & b.valid & (distance < thresholds.circle_match_distance)
-        return jnp.where(near, distance, jnp.inf), nis, both
+    step = new.center[:, None] - model.center[None]
+    near = new.valid[:, None] & model.valid[None]
+    distance = jnp.where(near, jnp.sqrt(dot(step, step)), jnp.inf)
+    slot = jnp.argmin(distance, -1).astype(jnp.int32)
+    distance = jnp.min(distance, -1)
+    near = distance < thresholds.circle_match_distance
 
-    by_model = jax.vmap(compare, (None, 0))
-    distance, nis, both = jax.vmap(by_model, (0, None))(new, model)
-    near = jnp.isfinite(distance)
-    agree = near & (~both | (nis < thresholds.circle_match_nis)) if rules.weigh_circles else near
-    slot, _, matched = least(distance, agree)
-    nearest, _, compared = least(distance, near)
-    rows = jnp.arange(slot.shape[0])
-    dof = jnp.where(compared & both[rows, nearest], 3, 0).astype(jnp.int32)
+    mine = jax.tree.map(lambda x: x[slot], model)
+    both = near & new.fitted & mine.fitted
+    change = jnp.concatenate([new.center - mine.center, (new.radius - mine.radius)[:, None]], -1)
+    cov = jnp.where(both[:, None, None], new.cov + mine.cov, jnp.eye(3, dtype=change.dtype)[None])
+    nis = jnp.where(both, quadratic(change, inverse(cov)), 0)
+    matched = near & (~both | (nis < thresholds.circle_match_nis)) if rules.weigh_circles else near
     return CircleMatches(
         slot=jnp.where(matched, slot, -1),
-        distance=jnp.where(matched, distance[rows, slot], 0),
-        nis=jnp.where(dof > 0, nis[rows, nearest], 0),
-        dof=dof,
-        ambiguous=compared & ~matched & rules.leave_out_ambiguous,
+        distance=jnp.where(matched, distance, 0),
+        nis=nis,
+        dof=jnp.where(both, 3, 0).astype(jnp.int32),
+        ambiguous=near & ~matched & rules.leave_out_ambiguous,
     )

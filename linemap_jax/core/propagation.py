@@ -29,7 +29,20 @@ def jacobian(
 def propagate(jac: Float[Array, "*s m n"], cov: Float[Array, "*#s n n"]) -> Float[Array, "*s m m"]:
     """Covariance of y = f(x) to first order, J C J^T."""
     cov = jnp.broadcast_to(cov, (*jac.shape[:-2], *cov.shape[-2:]))
-    return symmetric(jac @ cov @ jnp.swapaxes(jac, -1, -2))
+    return symmetric(product(product(jac, cov), jnp.swapaxes(jac, -1, -2)))
+
+
+def product(a: Float[Array, "*s l m"], b: Float[Array, "*s m n"]) -> Float[Array, "*s l n"]:
+    """Matrix product of many small matrices.
+
+    Written as a sum, which XLA fuses with what stands around it; its batched matrix product is a kernel of its own.
+    """
+    return jnp.sum(a[..., :, :, None] * b[..., None, :, :], -2)
+
+
+def apply(matrix: Float[Array, "*s m n"], vector: Float[Array, "*s n"]) -> Float[Array, "*s m"]:
+    """Matrix times vector for many small matrices."""
+    return jnp.sum(matrix * vector[..., None, :], -1)
 
 
 def symmetric(matrix: Float[Array, "*s n n"]) -> Float[Array, "*s n n"]:
@@ -60,7 +73,7 @@ def inverse(matrix: Float[Array, "*s n n"]) -> Float[Array, "*s n n"]:
 
 def quadratic(vector: Float[Array, "*s n"], matrix: Float[Array, "*s n n"]) -> Float[Array, "*s"]:
     """x^T A x."""
-    return jnp.einsum("...i,...ij,...j->...", vector, matrix, vector)
+    return jnp.sum(vector * apply(matrix, vector), -1)
 
 
 def _from_rows(rows: list[list[Array]]) -> Array:

@@ -99,7 +99,7 @@ class Capacity(NamedTuple):
     circles: int = 256
 
 
-SCAN_CAPACITY = Capacity(lines=64, circles=64)
+SCAN_CAPACITY = Capacity(lines=32, circles=64)
 """Slots for what a single scan holds."""
 
 

@@ -289,6 +289,13 @@ def resize(slots: SlotsT, capacity: int) -> SlotsT:
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), slots, empty(capacity - have, dtype))
 
 
+def pad_stack(stacked: Any, size: int) -> Any:
+    """Stacked items filled up to `size` by repeating the last one; whoever uses them knows how many count."""
+    return jax.tree.map(
+        lambda x: jnp.concatenate([x, jnp.broadcast_to(x[-1:], (size - x.shape[0], *x.shape[1:]))]), stacked
+    )
+
+
 def _as_float(x: ArrayLike | list | tuple) -> Array:
     """As an array of the dtype that came in; integers and plain numbers become jax's default float."""
     dtype = getattr(x, "dtype", None)

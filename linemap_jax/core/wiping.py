@@ -137,19 +137,19 @@ def passed_through(
     """
     normal, tangent = line.normal, line.tangent
     start = swath.robot - line.anchor + swath.laser
-    incidence = swath.beam @ normal
+    incidence = dot(swath.beam, normal[None])
     meets = jnp.abs(incidence) > NEAR_PARALLEL
     safe = jnp.where(meets, incidence, 1)
     distance = (line.offset - dot(normal, start)) / safe
     hit = swath.laser[None] + distance[:, None] * swath.beam
-    along = dot(tangent, start) + distance * (swath.beam @ tangent)
+    along = dot(tangent, start) + distance * dot(swath.beam, tangent[None])
 
     # n^T F C_pose F^T n with F = [I, perp(hit)]
-    lever = perp(hit) @ normal
+    lever = dot(perp(hit), normal[None])
     by_pose = (
         quadratic(normal, cov_pose[:2, :2]) + 2 * lever * dot(normal, cov_pose[:2, 2]) + lever**2 * cov_pose[2, 2]
     )
-    by_bearing = (distance * noise.bearing_sigma * (swath.beam @ tangent)) ** 2
+    by_bearing = (distance * noise.bearing_sigma * dot(swath.beam, tangent[None])) ** 2
     variance = noise.range_sigma**2 + (normal_variance(line.cov, along) + by_pose + by_bearing) / safe**2
     margin = jnp.maximum(thresholds.wipe_sigmas * jnp.sqrt(variance), thresholds.match_distance / jnp.abs(safe))
     reach = jnp.maximum(swath.range - margin, swath.reach)
@@ -310,7 +310,7 @@ def passed_circles(
 
         lateral = jnp.sqrt(spread(perp(ahead)) + (distance * noise.bearing_sigma) ** 2)
         depth = jnp.sqrt(spread(ahead) + noise.range_sigma**2)
-        along = swath.beam @ to_center
+        along = dot(swath.beam, to_center[None])
         window = jnp.abs(_cross(swath.beam, to_center[None])) < radius + thresholds.wipe_sigmas * lateral
         witness = swath.valid & window & (along > 0)
         beyond = swath.range > along + radius + thresholds.wipe_sigmas * depth

@@ -281,6 +281,7 @@ class _Parser:
                 f"the {name} message has {len(fields)} fields after its ranges, at most "
                 f"{len(names) - 1 + _TRAILING} are possible"
             )
+        numbers = _numbers(fields[: len(names)], "field", names)
         # A line that was cut off inside its time stamp would still parse, with a wrong stamp; so would one with a range
         # too many, with a wrong pose, unless the name of a host stands in the way.
         earlier = self._trailing.get(name, trailing)
@@ -288,7 +289,6 @@ class _Parser:
             raise _Fault(f"the {name} message lacks trailing fields that earlier ones have")
         if trailing > earlier and all(map(_is_number, fields[len(names) :])):
             raise _Fault(f"the {name} message has more fields after its ranges than earlier ones")
-        numbers = _numbers(fields[: len(names)], "field", names)
         if trailing == _TRAILING:
             _numbers(fields[-1:], "field", ("logger_timestamp",))
         for what, values in (("laser pose", numbers[:3]), ("robot pose", numbers[3:6]), ("time stamp", numbers[-1:])):

@@ -10,7 +10,7 @@ import dataclasses
 import json
 import os
 from collections.abc import Mapping
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -19,12 +19,11 @@ from numpy.typing import NDArray
 
 from linemap_jax.core.lines import rho_theta
 from linemap_jax.core.settings import Capacity
-from linemap_jax.core.state import Circles, LineMap, Lines, empty_circles, empty_lines
+from linemap_jax.core.state import Circles, LineMap, Lines, SlotsT, empty_circles, empty_lines
 from linemap_jax.io.atomic import OutputError, atomic_write
 
 Columns = dict[str, NDArray[Any]]
 """Field -> its values of all lines or circles; the first axis counts them, there are no free slots."""
-Slots = TypeVar("Slots", Lines, Circles)
 
 FORMAT = "linemap"
 VERSION = 1
@@ -120,9 +119,14 @@ def read_map(
     return line_map, document["settings"]
 
 
+@jax.jit  # step by step, each operation would be compiled by itself: a second for the first file
+def _view(lines: Lines) -> tuple[jax.Array, ...]:
+    """The fields of `_LINE_VIEW`."""
+    return *rho_theta(lines), lines.begin, lines.end
+
+
 def _entries_of_lines(lines: Lines) -> list[dict[str, Any]]:
-    rho, theta, cov = rho_theta(lines)
-    view = {"rho": rho, "theta": theta, "cov": cov, "begin": lines.begin, "end": lines.end}
+    view = dict(zip(_LINE_VIEW, _view(lines), strict=True))
     state = {name: lines.cov if name == "cov_local" else getattr(lines, name) for name in _LINE_STATE}
     return _entries({**view, "times_detected": lines.times_detected, **state}, lines.valid)
 
@@ -302,7 +306,7 @@ def _check(good: NDArray[Any], kind: str, name: str, fault: str) -> None:
         raise _Fault(f"{kind}[{int(np.argmin(good))}].{name} {fault}")
 
 
-def _fill(empty: Slots, columns: Columns, kind: str) -> Slots:
+def _fill(empty: SlotsT, columns: Columns, kind: str) -> SlotsT:
     """The slots of `empty`, the first ones filled."""
     count, capacity = columns["valid"].size, empty.valid.size
     if count > capacity:

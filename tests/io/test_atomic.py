@@ -43,10 +43,14 @@ def test_refuses_an_older_file_before_any_work(tmp_path: Path) -> None:
 
 def test_refuses_a_file_that_appeared_meanwhile(tmp_path: Path) -> None:
     target = tmp_path / "map.json"
-    with pytest.raises(OutputError, match="exists already"):
+
+    def write_late() -> None:
         with atomic_write(target, overwrite=False) as temporary:
             temporary.write_text("new")
             target.write_text("somebody else's")
+
+    with pytest.raises(OutputError, match="exists already"):
+        write_late()
     assert target.read_text() == "somebody else's"
     assert names(tmp_path) == ["map.json"]
 
@@ -76,10 +80,14 @@ def test_follows_a_link(tmp_path: Path) -> None:
 def test_leaves_nothing_behind_when_interrupted(tmp_path: Path, error: type[BaseException]) -> None:
     target = tmp_path / "map.json"
     target.write_text("old")
-    with pytest.raises(error):
+
+    def write_half() -> None:
         with atomic_write(target, overwrite=True) as temporary:
             temporary.write_text("half")
             raise error
+
+    with pytest.raises(error):
+        write_half()
     assert target.read_text() == "old"
     assert names(tmp_path) == ["map.json"]
 

@@ -95,7 +95,7 @@ def test_float32_has_short_decimals_that_are_exact(tmp_path: Path) -> None:
     """The decimal form goes through Python's float64 and must still meet the same float32."""
     rng = np.random.default_rng(2)
     bits = rng.integers(0, 2**32, 4000, dtype=np.uint32).view(np.float32)
-    offset = np.concatenate([bits[np.isfinite(bits) & (np.abs(bits) < 1e30)], np.float32([0.1, -0.0, 1e-45])])
+    offset = np.concatenate([bits[np.isfinite(bits) & (np.abs(bits) < 1e30)], np.array([0.1, -0.0, 1e-45], np.float32)])
     many = empty_lines(offset.size, jnp.float32)
     lines = dataclasses.replace(many, offset=jnp.asarray(offset), valid=jnp.ones(offset.size, bool))
     write_map(tmp_path / "map.json", LineMap(lines=lines, circles=empty_circles(1, jnp.float32)), {})

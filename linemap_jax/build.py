@@ -1,0 +1,197 @@
+"""A whole log into a map: the host loop around `update`.
+
+Scans go through a jitted `lax.scan` in chunks of one size, so that one compilation serves a log of any length. When a
+capacity runs full the chunk is done again with twice the room: no primitive is lost without a word.
+"""
+
+import dataclasses
+from collections.abc import Iterable, Iterator
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool
+
+from linemap_jax.core.extract import extract
+from linemap_jax.core.mapping import empty_map, update
+from linemap_jax.core.settings import SCAN_CAPACITY, Capacity
+from linemap_jax.core.state import LEFT_OUT, Extraction, LineMap, Pose, Report, Scan, Status, pad_stack, resize
+
+CHUNK = 64
+"""Scans in one jitted call. A compromise: the map is looked at once a chunk, and a chunk may have to be repeated."""
+
+
+def build(
+    scans: Scan,
+    poses: Pose,
+    *,
+    line_map: LineMap | None = None,
+    map_capacity: Capacity = Capacity(),
+    capacity: Capacity = SCAN_CAPACITY,
+    chunk: int = CHUNK,
+    **options: Any,
+) -> tuple[LineMap, Report]:
+    """Build a map from a whole log.
+
+    Args:
+      scans: `T` scans, stacked: each field has a leading axis `[T]`.
+      poses: `T` poses of the robot, stacked likewise.
+      line_map: a map to go on from; an empty one unless given.
+      map_capacity: slots to begin with; it grows as needed.
+      capacity: slots for what one scan holds; it grows as needed.
+      chunk: scans in one jitted call.
+      **options: the remaining keyword arguments of `update`.
+
+    Returns:
+      The map, and the reports of all scans, stacked `[T]`.
+
+    Raises:
+      ValueError: if scans and poses differ in number, or for what `update` refuses.
+    """
+    count = scans.ranges.shape[0]
+    if poses.mean.shape[0] != count:
+        raise ValueError(f"{count} scans and {poses.mean.shape[0]} poses: there must be one pose for each scan")
+    if scans.ranges.ndim != 2:
+        raise ValueError(f"scans must be stacked, with ranges [T, N], not {scans.ranges.shape}")
+    pieces = ((_slice(scans, i, i + chunk), _slice(poses, i, i + chunk)) for i in range(0, count, chunk))
+    reports = []
+    for line_map, report in build_chunks(
+        pieces, line_map=line_map, map_capacity=map_capacity, capacity=capacity, chunk=chunk, **options
+    ):
+        reports.append(report)
+    if line_map is None:
+        line_map = empty_map(map_capacity, scans.ranges.dtype)
+    return line_map, join_reports(reports)
+
+
+def build_chunks(
+    chunks: Iterable[tuple[Scan, Pose]],
+    *,
+    line_map: LineMap | None = None,
+    map_capacity: Capacity = Capacity(),
+    capacity: Capacity = SCAN_CAPACITY,
+    chunk: int = CHUNK,
+    **options: Any,
+) -> Iterator[tuple[LineMap, Report]]:
+    """Build a map from a log that comes piece by piece: memory does not grow with its length.
+
+    Args:
+      chunks: stacked scans and poses, at most `chunk` of them each time, all of one number of beams.
+      line_map: as for `build`.
+      map_capacity: as for `build`.
+      capacity: as for `build`.
+      chunk: as for `build`.
+      **options: the remaining keyword arguments of `update`.
+
+    Yields:
+      After each piece the map so far, and the reports of the piece. Capacities are grown by then: the statuses tell of
+      poses that were not finite, never of a primitive lost.
+
+    Raises:
+      ValueError: if a piece holds more than `chunk` scans.
+    """
+    for scans, poses in chunks:
+        count = scans.ranges.shape[0]
+        if count > chunk:
+            raise ValueError(f"a piece of {count} scans is longer than the chunk of {chunk}")
+        if line_map is None:
+            line_map = empty_map(map_capacity, scans.ranges.dtype)
+        # Fill up with scans that hold nothing, which change nothing.
+        active = jnp.arange(chunk) < count
+        scans, poses = pad_stack(scans, chunk), pad_stack(poses, chunk)
+        while True:
+            grown, report = _run(line_map, scans, poses, active, capacity=capacity, **options)
+            full = Status(int(np.bitwise_or.reduce(np.asarray(report.status))))
+            line_map, capacity, again = _grow(line_map, capacity, full)
+            if not again:
+                break
+        line_map = grown
+        yield line_map, _slice(report, 0, count)
+
+
+def extract_chunk(
+    scans: Scan, *, capacity: Capacity = SCAN_CAPACITY, chunk: int = CHUNK, **options: Any
+) -> tuple[Extraction, Capacity]:
+    """Extract a chunk of scans, each in the frame of its sensor, with measurement noise alone.
+
+    Args:
+      scans: at most `chunk` of them, stacked.
+      capacity: slots for what one scan holds; grows as needed.
+      chunk: scans in one jitted call.
+      **options: the remaining keyword arguments of `extract`.
+
+    Returns:
+      The extractions, stacked; and the capacity by then, to go on with.
+    """
+    count = scans.ranges.shape[0]
+    scans = pad_stack(scans, chunk)
+    while True:
+        found = _extract(scans, capacity=capacity, **options)
+        full = Status(int(np.bitwise_or.reduce(np.asarray(found.status)[:count])))
+        if not full:
+            return _slice(found, 0, count), capacity
+        capacity = _grow_scan(capacity, full)
+
+
+@partial(jax.jit, static_argnames=("capacity", "rules", "segmentation", "covariance", "jacobians"))
+def _extract(scans: Scan, **options: Any) -> Extraction:
+    dtype = scans.ranges.dtype
+    here = Pose(mean=jnp.zeros(3, dtype), cov=jnp.zeros((3, 3), dtype))
+    return jax.lax.map(lambda scan: extract(scan, here, **options), scans)
+
+
+@partial(jax.jit, static_argnames=("capacity", "rules", "segmentation", "covariance", "jacobians"))
+def _run(
+    line_map: LineMap, scans: Scan, poses: Pose, active: Bool[Array, " T"], **options: Any
+) -> tuple[LineMap, Report]:
+    def step(line_map: LineMap, x: tuple[Scan, Pose, Array]) -> tuple[LineMap, Report]:
+        scan, pose, is_active = x
+        scan = dataclasses.replace(scan, valid=scan.valid & is_active)
+        return update(line_map, scan, pose, **options)
+
+    return jax.lax.scan(step, line_map, (scans, poses, active))
+
+
+def _grow(line_map: LineMap, capacity: Capacity, full: Status) -> tuple[LineMap, Capacity, bool]:
+    """Twice the room where it ran out, and whether it did anywhere."""
+    capacity = _grow_scan(capacity, full)
+    if full & Status.MAP_LINES_FULL:
+        lines = line_map.lines
+        line_map = dataclasses.replace(line_map, lines=resize(lines, 2 * lines.valid.shape[0]))
+    if full & Status.MAP_CIRCLES_FULL:
+        circles = line_map.circles
+        line_map = dataclasses.replace(line_map, circles=resize(circles, 2 * circles.valid.shape[0]))
+    return line_map, capacity, bool(full & ~Status.POSE_NOT_FINITE)
+
+
+def _grow_scan(capacity: Capacity, full: Status) -> Capacity:
+    lines = 2 * capacity.lines if full & Status.SCAN_LINES_FULL else capacity.lines
+    circles = 2 * capacity.circles if full & Status.SCAN_CIRCLES_FULL else capacity.circles
+    return Capacity(lines, circles)
+
+
+def join_reports(reports: list[Report]) -> Report:
+    """The reports of several pieces as one. Pieces may differ in how many primitives a scan may hold.
+
+    Raises:
+      ValueError: if there is none.
+    """
+    if not reports:
+        raise ValueError("no scan, no report")
+    fill = {"line_slot": LEFT_OUT, "circle_slot": LEFT_OUT}
+
+    def join(name: str) -> Array:
+        arrays = [getattr(report, name) for report in reports]
+        if arrays[0].ndim == 1:
+            return jnp.concatenate(arrays)
+        width = max(a.shape[1] for a in arrays)
+        padded = [jnp.pad(a, ((0, 0), (0, width - a.shape[1])), constant_values=fill.get(name, 0)) for a in arrays]
+        return jnp.concatenate(padded)
+
+    return Report(**{field.name: join(field.name) for field in dataclasses.fields(Report)})
+
+
+def _slice(tree: Any, begin: int, end: int) -> Any:
+    return jax.tree.map(lambda x: x[begin:end], tree)

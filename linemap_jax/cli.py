@@ -1,0 +1,375 @@
+"""The command line: reads the options, and hands on between files, the build and the pictures."""
+
+import contextlib
+import dataclasses
+import json
+import os
+import sys
+import time
+from collections.abc import Iterator
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+if TYPE_CHECKING:
+    from linemap_jax.core.state import LineMap, Report
+    from linemap_jax.io.log import Log
+    from linemap_jax.io.scans import Chunk
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LogOptions:
+    """Options of all commands that read a log."""
+
+    preset: Literal["default", "paper"] = "default"
+    """The method: `paper` is the literal reading of 1996, `default` the same with its known faults mended."""
+    config: Path | None = None
+    """TOML file with tables [thresholds], [noise], [rules]; goes over the preset. Options given here go over both."""
+    range_sigma: Annotated[float | None, tyro.conf.arg(metavar="M")] = None
+    """Standard deviation of a range, m. 0.02 unless given."""
+    bearing_sigma: Annotated[float | None, tyro.conf.arg(metavar="RAD")] = None
+    """Standard deviation of a bearing, rad. 0.001 unless given."""
+    pose_sigma: Annotated[tuple[float, float, float], tyro.conf.arg(metavar="X Y THETA")] = (0.05, 0.05, 0.01)
+    """Standard deviations of every pose, m m rad: logs do not state them."""
+    range_min: Annotated[float, tyro.conf.arg(metavar="M")] = 0.0
+    """Smallest range that counts as a return, m."""
+    range_max: Annotated[float | None, tyro.conf.arg(metavar="M")] = None
+    """Ranges from here on are no-returns, m. What the log states, or 50, unless given."""
+    laser_offset: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y THETA")] = None
+    """Pose of the laser on the robot, m m rad. Used only with poses that are the robot's."""
+    covariance: Literal["exact", "printed"] | None = None
+    """`exact` to first order, or eq. 12 as `printed`. That of the preset unless given."""
+    jacobians: Literal["autodiff", "analytic"] = "analytic"
+    """Derivatives by autodiff through the estimate, or the hand-derived ones; the maps are the same."""
+    segmentation: Literal["incremental"] = "incremental"
+    """How points are divided into lines."""
+    every: Annotated[int, tyro.conf.arg(metavar="N")] = 1
+    """Take every N-th scan."""
+    dtype: Literal["float32", "float64"] = "float32"
+    """Precision of all numbers."""
+    strict: bool = False
+    """Refuse a log with malformed lines, instead of skipping and counting them."""
+    overwrite: bool = False
+    """Replace output that is there already."""
+    quiet: bool = False
+    """No progress, no warnings."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Build(LogOptions):
+    """Build a map from a log: writes map.json and map.png, and prints a summary."""
+
+    log: tyro.conf.Positional[Path]
+    """CARMEN log, plain or .gz."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="DIR")]
+    """Folder for the map; made if it is not there."""
+    json: bool = False
+    """Print the summary as JSON."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Extract(LogOptions):
+    """Extract lines and circles scan by scan: one JSON line a scan, in the frame of the sensor."""
+
+    log: tyro.conf.Positional[Path]
+    """CARMEN log, plain or .gz."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE.jsonl")]
+    """File to write."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Demo:
+    """Build a map from the log that ships with the package: a cluttered laboratory with poles."""
+
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="DIR")] = Path("linemap-demo")
+    """Folder for the map; made if it is not there."""
+    overwrite: bool = False
+    """Replace output that is there already."""
+    quiet: bool = False
+    """No progress, no warnings."""
+
+
+DEMO_NOISE = {"range_sigma": 0.015, "bearing_sigma": 0.0005, "pose_sigma": (0.01, 0.01, 0.002)}
+"""What the demo log was made with."""
+
+COUNTS = ("added", "fused", "merged", "trimmed", "split", "deleted")
+"""The counts of a `Report`."""
+
+
+class UsageError(Exception):
+    """What is wrong with the command, in one sentence."""
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+      args: the arguments; those of the process unless given.
+
+    Returns:
+      The exit status: 0; 2 for bad input, about which one sentence has been printed; 130 for an interrupt.
+    """
+    command = tyro.cli(
+        Annotated[Demo, tyro.conf.subcommand("demo")]
+        | Annotated[Build, tyro.conf.subcommand("build")]
+        | Annotated[Extract, tyro.conf.subcommand("extract")],
+        prog="linemap",
+        description="Maps of line segments and circles from 2D range scans, with covariances that can be believed.",
+        config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
+        args=args,
+    )
+    # What follows loads jax, which takes a second: not before the options are known to be right.
+    from linemap_jax.io.atomic import OutputError
+    from linemap_jax.io.config import ConfigError
+    from linemap_jax.io.log import LogError
+    from linemap_jax.io.map_file import MapFileError
+
+    try:
+        if isinstance(command, Extract):
+            return _extract(command)
+        return _build(_of_demo(command) if isinstance(command, Demo) else command)
+    except (LogError, OutputError, MapFileError, ConfigError, UsageError) as error:
+        print(f"linemap: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("linemap: interrupted", file=sys.stderr)
+        return 130
+
+
+def _of_demo(demo: Demo) -> Build:
+    log = resources.files("linemap_jax.io").joinpath("data", "demo.log.gz")
+    with resources.as_file(log) as path:
+        return Build(log=path, output=demo.output, overwrite=demo.overwrite, quiet=demo.quiet, **DEMO_NOISE)
+
+
+def _build(command: Build) -> int:
+    options = _options(command)
+    from linemap_jax.io.map_file import write_map
+    from linemap_jax.io.plot import plot_map
+
+    map_file, picture = command.output / "map.json", command.output / "map.png"
+    _prepare_folder(command.output, map_file, picture, overwrite=command.overwrite)
+    log = _open(command)
+    with _progress(command, log):
+        line_map, report, positions, seconds = _map_of_log(command, log, options)
+    _warn(command, log)
+
+    settings = {
+        "log": command.log.name,
+        "preset": command.preset,
+        "pose_sigma": command.pose_sigma,
+        **{name: options[name] for name in ("thresholds", "noise", "mount", "rules", "covariance", "jacobians")},
+    }
+    write_map(map_file, line_map, settings, overwrite=command.overwrite)
+    plot_map(picture, line_map, positions, title=command.log.name, overwrite=command.overwrite)
+    summary = _summary(command, line_map, report, options, seconds) | {"map": str(map_file), "picture": str(picture)}
+    print(json.dumps(summary, indent=2) if command.json else _in_words(summary))
+    return 0
+
+
+def _map_of_log(
+    command: Build, log: "Log", options: dict[str, Any]
+) -> tuple["LineMap", "Report", list[tuple[float, float]], list[float]]:
+    """The map, the reports, the positions of the robot, and the seconds that each chunk took, reading included."""
+    from linemap_jax.build import CHUNK, build_chunks, join_reports
+
+    positions, reports, seconds = [], [], []
+
+    def driven() -> Iterator[Any]:
+        for chunk in _chunks(command, log, CHUNK):
+            positions.extend(map(tuple, chunk.poses.mean[:, :2].tolist()))
+            yield chunk.scans, chunk.poses
+
+    line_map = None
+    started = time.perf_counter()
+    try:
+        for line_map, report in build_chunks(driven(), chunk=CHUNK, **options):
+            reports.append(report)
+            seconds.append(time.perf_counter() - started)
+            started = time.perf_counter()
+    except KeyboardInterrupt:
+        if line_map is None:
+            raise
+        print("linemap: interrupted; this is the map so far", file=sys.stderr)
+    assert line_map is not None  # a log without a scan has been refused by its reader
+    return line_map, join_reports(reports), positions, seconds
+
+
+def _summary(
+    command: Build, line_map: "LineMap", report: "Report", options: dict[str, Any], seconds: list[float]
+) -> dict[str, Any]:
+    """What `build` says about its map; for machines as JSON, for people in words."""
+    import numpy as np
+
+    from linemap_jax.build import CHUNK
+    from linemap_jax.lab.evaluation import duplicates, explained_share
+
+    chunks = ((chunk.scans, chunk.poses) for chunk in _chunks(command, _open(command), CHUNK))
+    share = explained_share(line_map, chunks, options["mount"], chunk=CHUNK)
+    lines = line_map.lines
+    length = np.asarray(lines.length)[np.asarray(lines.valid)]
+    return {
+        "log": str(command.log),
+        "preset": command.preset,
+        "scans": int(report.status.shape[0]),
+        "lines": int(lines.valid.sum()),
+        "circles": int(line_map.circles.valid.sum()),
+        "explained": share,
+        "median_line_length_m": float(np.median(length)) if length.size else 0.0,
+        "duplicates": int(duplicates(lines).sum()),
+        # The first chunk holds the compilation.
+        "us_per_scan": 1e6 * float(np.median(seconds[1:-1] or seconds)) / CHUNK,
+        "seconds_to_first_chunk": seconds[0],
+        "counts": {name: int(getattr(report, name).sum()) for name in COUNTS},
+    }
+
+
+def _in_words(summary: dict[str, Any]) -> str:
+    counts = ", ".join(f"{number} {what}" for what, number in summary["counts"].items())
+    return (
+        f"{summary['scans']} scans -> {summary['lines']} lines, {summary['circles']} circles ({counts})\n"
+        f"{summary['explained']:.1%} of the returns under 20 m lie within 10 cm of them; "
+        f"median line {summary['median_line_length_m']:.2f} m, {summary['duplicates']} duplicate lines\n"
+        f"{summary['us_per_scan']:.0f} us a scan, after {summary['seconds_to_first_chunk']:.1f} s to compile\n"
+        f"map:     {summary['map']}\n"
+        f"picture: {summary['picture']}"
+    )
+
+
+def _extract(command: Extract) -> int:
+    options = _options(command)
+    from linemap_jax.build import CHUNK, extract_chunk
+    from linemap_jax.core.settings import SCAN_CAPACITY
+    from linemap_jax.io.atomic import atomic_write
+    from linemap_jax.io.jsonl import lines_of_extraction
+
+    del options["mount"]  # the result stands in the frame of the sensor
+    log = _open(command)
+    capacity, written = SCAN_CAPACITY, 0
+    with atomic_write(command.output, overwrite=command.overwrite) as path, path.open("w", encoding="utf-8") as file:
+        with _progress(command, log):
+            for chunk in _chunks(command, log, CHUNK):
+                found, capacity = extract_chunk(chunk.scans, capacity=capacity, **options)
+                for line in lines_of_extraction(chunk.timestamps, chunk.poses, found):
+                    file.write(line + "\n")
+                    written += 1
+    _warn(command, log)
+    _say(command, f"{written} scans -> {command.output}")
+    return 0
+
+
+def _options(command: LogOptions) -> dict[str, Any]:
+    """The keyword arguments of `update`: preset, then the settings file, then the options of the command line."""
+    _check(command)
+    import jax
+
+    jax.config.update("jax_enable_x64", command.dtype == "float64")
+    jax.config.update("jax_compilation_cache_dir", str(_cache_folder()))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+    from linemap_jax.core.settings import Mount, SensorNoise, preset
+    from linemap_jax.io.config import read_config
+
+    options = preset(command.preset) | {"noise": SensorNoise(), "mount": Mount()}
+    for section, fields in (read_config(command.config) if command.config else {}).items():
+        options[section] = dataclasses.replace(options[section], **fields)
+    sigmas = {"range_sigma": command.range_sigma, "bearing_sigma": command.bearing_sigma}
+    given = {name: sigma for name, sigma in sigmas.items() if sigma is not None}
+    options["noise"] = dataclasses.replace(options["noise"], **given)
+    if command.laser_offset is not None:
+        options["mount"] = Mount(*command.laser_offset)
+    if command.covariance is not None:
+        options["covariance"] = command.covariance
+    return options | {"jacobians": command.jacobians, "segmentation": command.segmentation}
+
+
+def _check(command: LogOptions) -> None:
+    """Refuse numbers that make no sense."""
+    inf = float("inf")
+    if command.every < 1:
+        raise UsageError(f"--every must be at least 1, not {command.every}")
+    if not 0 <= command.range_min < inf:
+        raise UsageError(f"--range-min must be zero or positive, not {command.range_min}")
+    if command.range_max is not None and not command.range_min < command.range_max:
+        raise UsageError(f"--range-max must be more than --range-min, not {command.range_max}")
+    if command.range_sigma is not None and not 0 < command.range_sigma < inf:
+        raise UsageError(f"--range-sigma must be positive, not {command.range_sigma}")
+    if command.bearing_sigma is not None and not 0 <= command.bearing_sigma < inf:
+        raise UsageError(f"--bearing-sigma must be zero or positive, not {command.bearing_sigma}")
+    if not all(0 <= x < inf for x in command.pose_sigma):
+        raise UsageError(f"--pose-sigma must be zero or positive, not {command.pose_sigma}")
+    if command.laser_offset is not None and not all(-inf < x < inf for x in command.laser_offset):
+        raise UsageError(f"--laser-offset must be finite, not {command.laser_offset}")
+
+
+def _open(command: Build | Extract) -> "Log":
+    from linemap_jax.io.log import open_log
+
+    return open_log(command.log, strict=command.strict, range_max=command.range_max)
+
+
+def _chunks(command: LogOptions, log: "Log", size: int) -> Iterator["Chunk"]:
+    import numpy as np
+
+    from linemap_jax.io.scans import chunks_of_readings
+
+    cov_pose = np.diag(np.square(command.pose_sigma))
+    return chunks_of_readings(
+        log, size, cov_pose=cov_pose, range_min=command.range_min, every=command.every, dtype=command.dtype
+    )
+
+
+def _prepare_folder(folder: Path, *files: Path, overwrite: bool) -> None:
+    """Make the folder, and refuse before the work what would be refused after it."""
+    from linemap_jax.io.atomic import OutputError
+
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"cannot write to {folder}: it is not a folder")
+    for file in files:
+        if file.exists() and not overwrite:
+            raise OutputError(f"{file} exists already; use --overwrite to replace it")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"cannot make the folder {folder}: {error.strerror}") from error
+    if not os.access(folder, os.W_OK):
+        raise OutputError(f"cannot write to the folder {folder}: permission denied")
+
+
+def _cache_folder() -> Path:
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(base) / "linemap_jax"
+
+
+@contextlib.contextmanager
+def _progress(command: LogOptions | Build, log: "Log") -> Iterator[None]:
+    """A progress bar over the bytes of the log, where somebody watches."""
+    if command.quiet or not sys.stderr.isatty():
+        yield
+        return
+    from tqdm import tqdm
+
+    with tqdm(unit="B", unit_scale=True, leave=False) as bar:
+
+        def show(read: int, total: int) -> None:
+            bar.total = total
+            bar.update(read - bar.n)
+
+        log.progress = show
+        yield
+        log.progress = None
+
+
+def _warn(command: LogOptions, log: "Log") -> None:
+    for warning in log.notes.warnings():
+        _say(command, f"warning: {log.path}: {warning}")
+
+
+def _say(command: LogOptions, sentence: str) -> None:
+    if not command.quiet:
+        print(f"linemap: {sentence}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

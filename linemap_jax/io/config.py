@@ -1,0 +1,60 @@
+"""Settings from a TOML file."""
+
+import dataclasses
+import difflib
+import os
+import tomllib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from linemap_jax.core.settings import Rules, SensorNoise, Thresholds
+
+SECTIONS: dict[str, type] = {"thresholds": Thresholds, "noise": SensorNoise, "rules": Rules}
+"""The tables of a settings file, and what their keys are the fields of."""
+
+
+class ConfigError(Exception):
+    """What is wrong with a settings file: one sentence that names the file and the cause."""
+
+
+def read_config(path: str | os.PathLike[str]) -> dict[str, dict[str, Any]]:
+    """Read a settings file: tables `[thresholds]`, `[noise]` and `[rules]`, each with some of their fields.
+
+    Args:
+      path: of the TOML file.
+
+    Returns:
+      For each table in the file, the fields that it sets.
+
+    Raises:
+      ConfigError: if the file cannot be read, is no TOML, has a table or key that does not exist (the message names the
+        nearest one that does), or a value of the wrong kind.
+    """
+    try:
+        tables = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"cannot read {os.fspath(path)}: {error.strerror or error}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{os.fspath(path)} is not a TOML file: {error}") from error
+    for section, table in tables.items():
+        if section not in SECTIONS:
+            raise ConfigError(f"{os.fspath(path)}: no table [{section}]{_nearest(section, SECTIONS)}")
+        if not isinstance(table, dict):
+            raise ConfigError(f"{os.fspath(path)}: {section} must be a table, [{section}]")
+        fields = {field.name for field in dataclasses.fields(SECTIONS[section])}
+        for key, value in table.items():
+            if key not in fields:
+                raise ConfigError(f"{os.fspath(path)}: no key {key!r} in [{section}]{_nearest(key, fields)}")
+            is_switch = section == "rules"
+            if isinstance(value, bool) != is_switch or not isinstance(value, int | float):
+                kind = "true or false" if is_switch else "a number"
+                raise ConfigError(f"{os.fspath(path)}: {key} in [{section}] must be {kind}, not {value!r}")
+            if not is_switch and not 0 <= value < float("inf"):
+                raise ConfigError(f"{os.fspath(path)}: {key} in [{section}] must be zero or positive, not {value}")
+    return tables
+
+
+def _nearest(name: str, known: Iterable[str]) -> str:
+    near = difflib.get_close_matches(name, list(known), 1, 0.0)
+    return f"; did you mean {near[0]!r}?" if near else ""

@@ -1,0 +1,1 @@
+"""Experiments on top of the core: what a map is worth."""
