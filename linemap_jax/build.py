@@ -17,7 +17,8 @@ from jaxtyping import Array, Bool
 from linemap_jax.core.extract import extract
 from linemap_jax.core.mapping import empty_map, update
 from linemap_jax.core.settings import SCAN_CAPACITY, Capacity
-from linemap_jax.core.state import LEFT_OUT, Extraction, LineMap, Pose, Report, Scan, Status, pad_stack, resize
+from linemap_jax.core.slots import resize
+from linemap_jax.core.state import LEFT_OUT, Extraction, LineMap, Pose, Report, Scan, Status, pad_stack
 
 CHUNK = 64
 """Scans in one jitted call. A compromise: the map is looked at once a chunk, and a chunk may have to be repeated."""

@@ -128,6 +128,9 @@ class Report:
     split: int = 0
     deleted: int = 0
     status: int = 0
+    tie_margin: float = math.inf
+    """By how much (NIS) the choice closest to a tie was decided. The fragments of a line that wiping has split have one
+    and the same NIS but for rounding, so two implementations may differ where this is of that size."""
 
 
 class Sweep(NamedTuple):
@@ -420,8 +423,10 @@ def jac_line_points(points: np.ndarray, anchor: np.ndarray) -> np.ndarray:
     return h @ np.stack([slope_by, const_by], 1)
 
 
-def _line_of_run(sweep: Sweep, run: list[int], *, covariance: str) -> dict[str, np.ndarray]:
-    """The fields of one line from its points: estimate, end points, covariance; s4.2.3-4.2.5."""
+def _line_of_run(
+    sweep: Sweep, run: list[int], *, covariance: str, min_length: float, margin: Margin
+) -> dict[str, Any] | None:
+    """The fields of one line from its points: estimate, end points, covariance; s4.2.3-4.2.5. None if too short."""
     o, r, u = sweep.o[run], sweep.r[run], sweep.u[run]
     line = regression(o)
     anchor = sweep.p + line.centroid
@@ -431,22 +436,21 @@ def _line_of_run(sweep: Sweep, run: list[int], *, covariance: str) -> dict[str, 
     tangent = np.array([-normal[1], normal[0]])
     offset = normal @ (line.centroid - here)
     extent = np.array([tangent @ (o[0] - here), tangent @ (o[-1] - here)])
+    if not margin.below(min_length, extent[1] - extent[0]):
+        return None
 
     f, g = jac_point_pose(o), jac_point_measurement(r, u)
     cov_sensor = sandwich(g, np.diag([sweep.sr**2, sweep.sa**2]))
     cov_points = sandwich(f, sweep.cov_pose) + cov_sensor
-    cov_measurement, jac_line_pose, cov = np.eye(2), np.zeros((2, 3)), np.eye(2)
-    # Points that are all equal are no line; their run is too short, and its covariance is never looked at.
-    if extent[1] > extent[0]:
-        j = jac_line_points(o, here)
-        if covariance == "printed":
-            # Departure that the paper makes, not we: Eq. (12) sums the pose error as if each point had its own.
-            cov_measurement = symmetric(sandwich(j, cov_points).sum(0))
-            cov = cov_measurement
-        else:
-            cov_measurement = symmetric(sandwich(j, cov_sensor).sum(0))
-            jac_line_pose = (j @ f).sum(0)
-            cov = symmetric(cov_measurement + sandwich(jac_line_pose, sweep.cov_pose))
+    j = jac_line_points(o, here)
+    if covariance == "printed":
+        # Departure that the paper makes, not we: Eq. (12) sums the pose error as if each point had its own.
+        cov_measurement = symmetric(sandwich(j, cov_points).sum(0))
+        jac_line_pose, cov = np.zeros((2, 3)), cov_measurement
+    else:
+        cov_measurement = symmetric(sandwich(j, cov_sensor).sum(0))
+        jac_line_pose = (j @ f).sum(0)
+        cov = symmetric(cov_measurement + sandwich(jac_line_pose, sweep.cov_pose))
 
     var_extent = np.zeros(2)
     for side, k in ((0, 0), (1, -1)):
@@ -655,8 +659,8 @@ def extract(
         if len(run) < 3:
             rejected["too_few"] += len(run)
             continue
-        line = _line_of_run(sweep, run, covariance=covariance)
-        if not margin.below(float(thresholds.min_length), line["extent"][1] - line["extent"][0]):
+        line = _line_of_run(sweep, run, covariance=covariance, min_length=float(thresholds.min_length), margin=margin)
+        if line is None:
             rejected["too_short"] += len(run)
             continue
         in_line[run] = True
@@ -833,6 +837,17 @@ def _var_across(cov: np.ndarray, s: np.ndarray) -> np.ndarray:
     return cov[:, None, 0, 0] - 2 * s * cov[:, None, 0, 1] + s**2 * cov[:, None, 1, 1]
 
 
+def closest(nis: np.ndarray, good: np.ndarray, ties: Margin) -> int | None:
+    """Which of the good candidates has the least NIS, the first of equals; None if none is good."""
+    candidates = np.flatnonzero(good)
+    if not len(candidates):
+        return None
+    order = candidates[np.argsort(nis[candidates], kind="stable")]
+    if len(order) > 1:
+        ties.below(float(nis[order[0]]), float(nis[order[1]]))
+    return int(order[0])
+
+
 class Match(NamedTuple):
     """What the map says of one new line."""
 
@@ -842,22 +857,24 @@ class Match(NamedTuple):
     dof: int
 
 
-def match_line(new: Lines, lines: Lines, *, thresholds: Any) -> Match:
+def match_line(new: Lines, lines: Lines, *, thresholds: Any, ties: Margin) -> Match:
     """The line of the map that one new line (of length 1) is."""
     slots = np.flatnonzero(lines.valid)
     if not len(slots):
         return Match(-1, -1, 0.0, 0)
     g = gates(new, lines.take(slots), thresholds=thresholds)
-    if not g.geometric.any():
-        return Match(-1, -1, 0.0, 0)
     # The statistical gate is one threshold on the same number: the least NIS is the match or nothing is.
-    best = int(np.argmin(np.where(g.geometric, g.nis, np.inf)))
+    best = closest(g.nis, g.geometric, ties)
+    if best is None:
+        return Match(-1, -1, 0.0, 0)
     slot = int(slots[best])
     matched = bool(g.statistical[best])
     return Match(slot if matched else -1, -1 if matched else slot, float(g.nis[best]), 2)
 
 
-def group_new(found: Extraction, unmatched: list[int], *, thresholds: Any, rules: Any) -> dict[int, list[int]]:
+def group_new(
+    found: Extraction, unmatched: list[int], *, thresholds: Any, rules: Any, ties: Margin
+) -> dict[int, list[int]]:
     """New lines that are no line of the map, with those that continue them: root -> pieces, the root first."""
     cov = found.cov_measurement if rules.share_pose else found.lines.cov
     lines = dataclasses.replace(found.lines, cov=cov)
@@ -866,9 +883,9 @@ def group_new(found: Extraction, unmatched: list[int], *, thresholds: Any, rules
         roots = list(groups)
         if roots:
             g = gates(lines.take(i), lines.take(roots), thresholds=thresholds)
-            good = g.geometric & g.statistical
-            if good.any():
-                groups[roots[int(np.argmin(np.where(good, g.nis, np.inf)))]].append(i)
+            best = closest(g.nis, g.geometric & g.statistical, ties)
+            if best is not None:
+                groups[roots[best]].append(i)
                 continue
         groups[i] = [i]
     return groups
@@ -992,7 +1009,7 @@ def _add(lines: Lines, slot: int, pieces: Pieces, cov: np.ndarray, cov_pose: np.
 # Merging
 
 
-def _merge(lines: Lines, targets: np.ndarray, *, thresholds: Any) -> dict[int, int]:
+def _merge(lines: Lines, targets: np.ndarray, *, thresholds: Any, ties: Margin) -> dict[int, int]:
     """Join lines of the map that this scan has shown to be one. Returns the freed slots and where each went."""
     candidates: list[tuple[float, int, int, int]] = []  # NIS, new line, lower slot, higher slot
     for i, g in enumerate(targets):
@@ -1002,9 +1019,8 @@ def _merge(lines: Lines, targets: np.ndarray, *, thresholds: Any) -> dict[int, i
             continue
         low, high = np.minimum(g, others), np.maximum(g, others)
         pairs = gates(lines.take(high), lines.take(low), thresholds=thresholds)
-        good = pairs.geometric & pairs.statistical & (pairs.gap < 0)
-        if good.any():
-            best = int(np.argmin(np.where(good, pairs.nis, np.inf)))
+        best = closest(pairs.nis, pairs.geometric & pairs.statistical & (pairs.gap < 0), ties)
+        if best is not None:
             candidates.append((float(pairs.nis[best]), i, int(low[best]), int(high[best])))
 
     freed: dict[int, int] = {}
@@ -1268,7 +1284,7 @@ def _update_circles(
             added.append(i)
 
     # What is about to be fused was seen, and is spared.
-    for slot in np.flatnonzero(circles.valid):
+    for slot in np.flatnonzero(circles.valid).tolist():
         if slot in members:
             continue
         if rules.wipe_by_beams:
@@ -1297,7 +1313,7 @@ def _update_circles(
         report.added += 1
 
     seen = lines.take([slot for slot in set(targets.tolist()) if slot >= 0 and lines.valid[slot]])
-    for slot in np.flatnonzero(circles.valid):
+    for slot in np.flatnonzero(circles.valid).tolist():
         if (distance_to_segments(circles.center[slot], seen) < reach).any():
             _free(circles, slot)
             report.deleted += 1
@@ -1369,10 +1385,11 @@ def update(
     lines = new_map.lines
 
     into = _lines_one_by_one if mode == "sequential" else _lines_at_once
-    targets, suspects, triangles = into(lines, found, sweep, report, thresholds=thresholds, rules=rules)
+    ties = Margin()
+    targets, suspects, triangles = into(lines, found, sweep, report, thresholds=thresholds, rules=rules, ties=ties)
 
     if rules.merge:
-        freed = _merge(lines, targets, thresholds=thresholds)
+        freed = _merge(lines, targets, thresholds=thresholds, ties=ties)
         report.merged += len(freed)
         for slots in (targets, suspects, report.line_slot):
             slots[:] = [freed.get(slot, slot) for slot in slots.tolist()]
@@ -1393,11 +1410,12 @@ def update(
 
     _update_circles(new_map, found, sweep, targets, triangles, report, thresholds=thresholds, rules=rules)
     report.status = int(report.status)
+    report.tie_margin = ties.smallest
     return new_map, report
 
 
 def _lines_at_once(
-    lines: Lines, found: Extraction, sweep: Sweep, report: Report, *, thresholds: Any, rules: Any
+    lines: Lines, found: Extraction, sweep: Sweep, report: Report, *, thresholds: Any, rules: Any, ties: Margin
 ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
     """Match all new lines against the map as it stood, then fuse and add.
 
@@ -1410,7 +1428,7 @@ def _lines_at_once(
     pieces: dict[int, list[int]] = {}
     unmatched = []
     for i in range(n):
-        match = match_line(found.lines.take(i), lines, thresholds=thresholds)
+        match = match_line(found.lines.take(i), lines, thresholds=thresholds, ties=ties)
         report.line_nis[i], report.line_dof[i] = match.nis, match.dof
         if match.slot >= 0:
             targets[i] = report.line_slot[i] = match.slot
@@ -1420,7 +1438,7 @@ def _lines_at_once(
         else:
             unmatched.append(i)
 
-    groups = group_new(found, unmatched, thresholds=thresholds, rules=rules)
+    groups = group_new(found, unmatched, thresholds=thresholds, rules=rules, ties=ties)
     for slot, index in pieces.items():
         seen = pieces_of(found, index, rules=rules)
         _fuse_into(lines, slot, seen, sweep.cov_pose, thresholds=thresholds, rules=rules)
@@ -1438,7 +1456,7 @@ def _lines_at_once(
 
 
 def _lines_one_by_one(
-    lines: Lines, found: Extraction, sweep: Sweep, report: Report, *, thresholds: Any, rules: Any
+    lines: Lines, found: Extraction, sweep: Sweep, report: Report, *, thresholds: Any, rules: Any, ties: Margin
 ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
     """The order of the paper: each new line is matched, fused or added, and wipes, before the next one.
 
@@ -1450,7 +1468,7 @@ def _lines_one_by_one(
     targets, suspects = np.full(n, -1), np.full(n, -1)
     triangles: list[np.ndarray] = []
     for i in range(n):
-        match = match_line(found.lines.take(i), lines, thresholds=thresholds)
+        match = match_line(found.lines.take(i), lines, thresholds=thresholds, ties=ties)
         report.line_nis[i], report.line_dof[i] = match.nis, match.dof
         seen = pieces_of(found, [i], rules=rules)
         if match.slot >= 0:

@@ -8,14 +8,15 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from linemap_jax.core.frames import dot, perp
-from linemap_jax.core.lines import Runs, runs_from_labels
 from linemap_jax.core.propagation import apply, inverse, propagate
+from linemap_jax.core.runs import Runs
 from linemap_jax.core.sensor import Points
 from linemap_jax.core.settings import SensorNoise, Thresholds
-from linemap_jax.core.state import Circles, Lines, Pose, Scan
+from linemap_jax.core.slots import neutral_where_free
+from linemap_jax.core.state import Circles, Lines, Pose
 
 MIN_FIT_POINTS = 5
 """A circle has three unknowns; with fewer than five points its residuals say nothing about the fit."""
@@ -23,63 +24,57 @@ GAUSS_NEWTON_STEPS = 5
 """From the algebraic start the geometric fit has converged to rounding after four steps on poles seen in practice."""
 
 
-class _Cluster(NamedTuple):
-    """The cluster under extraction; packed into one array as in the segmentation."""
+class Cluster(NamedTuple):
+    """The cluster under extraction, as it stands at some point; sums are from its first point."""
 
-    n: Array
+    n: Array  # number of points
     x0: Array  # first point
     y0: Array
-    x: Array  # sums of Eq. (18), from the first point
+    x: Array  # sums of Eq. (18)
     y: Array
+    xxyy: Array  # sum of x^2 + y^2, for Eq. (20)
 
 
-def cluster(
-    position: Float[Array, "N 2"], valid: Bool[Array, " N"], free: Bool[Array, " N"], thresholds: Thresholds
-) -> Runs:
+def cluster(points: Points, free: Bool[Array, " N"], thresholds: Thresholds) -> tuple[Bool[Array, " N"], Cluster]:
     """Section 4.3.1: consecutive points that no line took, each near the centre of those before it.
 
     Args:
-      position: the points. Shape `[N, 2]`.
-      valid: beams that have a point.
-      free: of these, the ones that no line took.
+      points: the points of the scan.
+      free: the ones that no line took.
       thresholds: `cluster_distance`.
 
     Returns:
-      The clusters, with room for all that `N` beams can hold; clusters of one point among them.
+      Which points are the last of their cluster, shape `[N]`; the cluster as it stood at each point, each field `[N]`.
     """
 
-    def step(carry: Array, beam: tuple[Array, ...]) -> tuple[Array, Array]:
-        c = _Cluster(*carry)
-        px, py, is_valid, is_free = beam
+    def body(carry: Array, row: Array) -> tuple[Array, Array]:
+        c = Cluster(*carry)
+        px, py, is_free = row
         n = jnp.maximum(c.n, 1)
         x, y = px - c.x0, py - c.y0
-        near = (x - c.x / n) ** 2 + (y - c.y / n) ** 2 < thresholds.cluster_distance**2
+        dx, dy = n * x - c.x, n * y - c.y
+        near = dx * dx + dy * dy < (n * thresholds.cluster_distance) ** 2
         joins = (c.n > 0) & near
-        keep = joins.astype(carry.dtype)
-        joined = jnp.stack(
-            [
-                c.n * keep + 1,
-                jnp.where(joins, c.x0, px),
-                jnp.where(joins, c.y0, py),
-                (c.x + x) * keep,
-                (c.y + y) * keep,
-            ]
-        )
-        # A point of a line ends the cluster; a beam without a return does not.
-        after = jnp.where(is_free, joined, jnp.zeros_like(carry))
-        return jnp.where(is_valid, after, carry), is_free & ~joins
+        x0, y0 = jnp.where(joins, c.x0, px), jnp.where(joins, c.y0, py)
+        x, y = px - x0, py - y0
+        old = jnp.where(joins, 1, 0).astype(carry.dtype)
+        joined = Cluster(c.n * old + 1, x0, y0, c.x * old + x, c.y * old + y, c.xxyy * old + (x * x + y * y))
+        carry = jnp.stack(joined) * is_free  # a point of a line ends the cluster
+        return carry, carry
 
-    start = jnp.zeros(len(_Cluster._fields), position.dtype)
-    _, starts = jax.lax.scan(step, start, (position[:, 0], position[:, 1], valid, free))
-    label = jnp.cumsum(starts) - 1
-    return runs_from_labels(jnp.where(free, label, -1).astype(jnp.int32), position.shape[0])
+    start = jnp.zeros(len(Cluster._fields), points.range.dtype)
+    rows = jnp.concatenate([points.position, free.astype(start.dtype)[:, None]], -1)
+    _, running = jax.lax.scan(body, start, rows)
+    running = Cluster(*jnp.moveaxis(running, -1, 0))
+    goes_on = jnp.concatenate([running.n[1:] > 1, jnp.zeros(1, bool)])
+    return free & ~goes_on, running
 
 
 def measure_circles(
     points: Points,
-    scan: Scan,
     pose: Pose,
     clusters: Runs,
+    running: Cluster,
     thresholds: Thresholds,
     noise: SensorNoise,
     *,
@@ -89,36 +84,32 @@ def measure_circles(
 
     Args:
       points: the points of the scan.
-      scan: the scan.
       pose: of the robot.
-      clusters: which points belong together.
+      clusters: which points belong together, at least two in each.
+      running: the cluster as it stood at each point.
       thresholds: `cluster_distance` bounds a fitted radius.
       noise: of the sensor.
       fit: fit a circle where there are points enough; otherwise Eqs. (18)-(20) throughout.
 
     Returns:
-      One circle a cluster, in the world; valid where there are at least two points.
+      One circle a cluster, in the world.
     """
-    n = clusters.count
-    count = jnp.maximum(n, 1).astype(points.position.dtype)
+    whole = Cluster(*(x[clusters.last] for x in running))
+    n = jnp.maximum(whole.n, 2)
     # Eq. (18), from the first point of the cluster
-    origin = points.position[clusters.first]
-    offset = points.position - clusters.spread(origin)
-    centroid = clusters.sum(offset) / count[:, None]
+    centroid = jnp.stack([whole.x, whole.y], -1) / n[:, None]
     # Eqs. (19)-(20)
-    z = offset - clusters.spread(centroid)
-    variance = clusters.sum(dot(z, z)) / jnp.maximum(count - 1, 1)
+    variance = (whole.xxyy - n * dot(centroid, centroid)) / (n - 1)
     positive = variance > 0
     radius = jnp.where(positive, jnp.sqrt(jnp.where(positive, variance, 1)), 0)
-    middle = origin + centroid
+    center = jnp.stack([whole.x0, whole.y0], -1) + centroid
 
     k = n.shape[0]
     cov = jnp.zeros((k, 3, 3), radius.dtype)
     fitted = jnp.zeros(k, bool)
-    center = middle
     if fit:
-        shift, fit_radius, cov_fit, fitted = _fit_circles(points, scan, clusters, z, middle, thresholds, noise)
-        center = middle + jnp.where(fitted[:, None], shift, 0)
+        shift, fit_radius, cov_fit, fitted = _fit_circles(points, clusters, n, center, thresholds, noise)
+        center = center + jnp.where(fitted[:, None], shift, 0)
         radius = jnp.where(fitted, fit_radius, radius)
         # The centre moves with the pose as every point does; the radius does not.
         one, zero = jnp.ones_like(radius), jnp.zeros_like(radius)
@@ -126,21 +117,21 @@ def measure_circles(
         rows = [[one, zero, turn[:, 0]], [zero, one, turn[:, 1]], [zero, zero, zero]]
         jac_circle_pose = jnp.stack([jnp.stack(row, -1) for row in rows], -2)
         cov = jnp.where(fitted[:, None, None], cov_fit + propagate(jac_circle_pose, pose.cov), 0)
-    return Circles(
+    circles = Circles(
         center=pose.mean[None, :2] + center,
         radius=radius,
         cov=cov,
         fitted=fitted,
-        times_detected=jnp.ones_like(n),
-        valid=n >= 2,
+        times_detected=jnp.ones_like(clusters.last),
+        valid=clusters.valid,
     )
+    return neutral_where_free(circles)
 
 
 def _fit_circles(
     points: Points,
-    scan: Scan,
     clusters: Runs,
-    z: Float[Array, "N 2"],
+    n: Float[Array, " K"],
     middle: Float[Array, "K 2"],
     thresholds: Thresholds,
     noise: SensorNoise,
@@ -151,9 +142,8 @@ def _fit_circles(
 
     Args:
       points: the points of the scan.
-      scan: the scan.
       clusters: which points belong together.
-      z: the points, from the centroid of their cluster. Shape `[N, 2]`.
+      n: how many they are. Shape `[K]`.
       middle: the centroids, from the robot. Shape `[K, 2]`.
       thresholds: `cluster_distance`, the largest radius.
       noise: of the sensor.
@@ -162,8 +152,7 @@ def _fit_circles(
       The centres from the centroids, the radii, the covariances of (x, y, radius) from the sensor's noise, and which
       fits are to be believed.
     """
-    n = clusters.count
-    count = jnp.maximum(n, 1).astype(z.dtype)
+    z = points.position - clusters.spread(middle)
     w = dot(z, z)
     x, y = z[:, 0], z[:, 1]
     sums = clusters.sum(jnp.stack([x * x, x * y, y * y, x * w / 2, y * w / 2, w], -1))
@@ -172,42 +161,46 @@ def _fit_circles(
     solvable = (n >= MIN_FIT_POINTS) & (det > 1e-6 * (sxx + syy) ** 2)
     safe = jnp.where(solvable, det, 1)
     a, b = (bx * syy - by * sxy) / safe, (by * sxx - bx * sxy) / safe
-    circle = jnp.stack([a, b, jnp.sqrt(sw / count + a * a + b * b)], -1)
+    circle = jnp.stack([a, b, jnp.sqrt(sw / n + a * a + b * b)], -1)
     circle = jnp.where(solvable[:, None], circle, jnp.ones_like(circle))
 
-    def linearise(circle: Array) -> tuple[Array, Array, Array, Array]:
-        """Residuals f, directions e from the centre, and A^T A of the rows A = [-e, -1]."""
-        to_point = z - clusters.spread(circle[:, :2])
+    def linearise(circle: Array) -> tuple[Array, Array, Array]:
+        """Residuals f, directions e from the centre, and the rows A = [-e, -1] of their Jacobian."""
+        mine = clusters.spread(circle)
+        to_point = z - mine[:, :2]
         distance = jnp.sqrt(dot(to_point, to_point))
         e = to_point / jnp.where(distance > 0, distance, 1)[:, None]
-        rows = jnp.concatenate([-e, -jnp.ones_like(e[:, :1])], -1)
-        return distance - clusters.spread(circle[:, 2]), e, rows, clusters.sum(rows[:, :, None] * rows[:, None, :])
+        return distance - mine[:, 2], e, jnp.concatenate([-e, -jnp.ones_like(e[:, :1])], -1)
 
     def step(_: int, circle: Array) -> Array:
-        residual, _, rows, normal_matrix = linearise(circle)
-        gradient = clusters.sum(rows * residual[:, None])
-        return circle - apply(inverse(normal_matrix), gradient)
+        residual, _, rows = linearise(circle)
+        # A^T A and A^T f in one sum
+        sums = clusters.sum(rows[:, :, None] * jnp.concatenate([rows, residual[:, None]], -1)[:, None, :])
+        return circle - apply(inverse(sums[..., :3]), sums[..., 3])
 
     circle = jax.lax.fori_loop(0, GAUSS_NEWTON_STEPS, step, circle)
-    residual, e, rows, normal_matrix = linearise(circle)
+    residual, e, rows = linearise(circle)
     along = dot(e, points.beam) ** 2
-    variance = noise.range_sigma**2 * along + (scan.ranges * noise.bearing_sigma) ** 2 * (1 - along)
-    cov = propagate(inverse(normal_matrix), clusters.sum(rows[:, :, None] * rows[:, None, :] * variance[:, None, None]))
+    variance = noise.range_sigma**2 * along + (points.range * noise.bearing_sigma) ** 2 * (1 - along)
+    square = rows[:, :, None] * rows[:, None, :]
+    chi2 = residual**2 / jnp.where(variance > 0, variance, 1)
+    columns = [square.reshape(-1, 9), (square * variance[:, None, None]).reshape(-1, 9), chi2[:, None]]
+    sums = clusters.sum(jnp.concatenate(columns, -1))
+    misfit = sums[:, 18]
+    cov = propagate(inverse(sums[:, :9].reshape(-1, 3, 3)), sums[:, 9:18].reshape(-1, 3, 3))
 
     center, radius = circle[:, :2], circle[:, 2]
-    misfit = clusters.sum(residual**2 / jnp.where(variance > 0, variance, 1))
     believed = (
         solvable
         & jnp.all(jnp.isfinite(circle), -1)
+        & jnp.all(jnp.isfinite(cov), (-1, -2))
         & (radius >= 5 * noise.range_sigma)  # smaller ones are lost in the noise
         & (radius < thresholds.cluster_distance)
         & (dot(middle - points.laser[None], center) > 0)  # we see the near side of a pole, never its inside
-        & (misfit <= count + 3 * jnp.sqrt(2 * count))  # 3 sigma of chi-square
+        & (misfit <= n + 3 * jnp.sqrt(2 * n))  # 3 sigma of chi-square
         & (cov[:, 2, 2] < (radius / 3) ** 2)
     )
-    finite = jnp.all(jnp.isfinite(circle), -1) & jnp.all(jnp.isfinite(cov), (-1, -2))
-    keep = believed & finite
-    return center, radius, jnp.where(keep[:, None, None], cov, 0), keep
+    return center, radius, jnp.where(believed[:, None, None], cov, 0), believed
 
 
 def near_lines(circles: Circles, lines: Lines, thresholds: Thresholds) -> Bool[Array, " C"]:

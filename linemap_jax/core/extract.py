@@ -9,9 +9,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from linemap_jax.core import circles as circles_
-from linemap_jax.core import lines as lines_
-from linemap_jax.core.sensor import points_from_scan
+from linemap_jax.core.lines import MIN_POINTS, length_of_run, measure_lines
+from linemap_jax.core.runs import select_runs
 from linemap_jax.core.segmentation import incremental
+from linemap_jax.core.segmentation.incremental import Run
+from linemap_jax.core.sensor import Points, points_from_scan
 from linemap_jax.core.settings import (
     SCAN_CAPACITY,
     Capacity,
@@ -23,7 +25,8 @@ from linemap_jax.core.settings import (
     SensorNoise,
     Thresholds,
 )
-from linemap_jax.core.state import Circles, Extraction, Pose, Rejected, Scan, Status, empty_circles
+from linemap_jax.core.slots import neutral_where_free
+from linemap_jax.core.state import Extraction, Pose, Rejected, Scan, Status
 
 
 @partial(jax.jit, static_argnames=("capacity", "rules", "segmentation", "covariance", "jacobians"))
@@ -58,69 +61,97 @@ def extract(
       jacobians: "autodiff" through the estimate, or "analytic", the hand-derived ones.
 
     Returns:
-      The primitives in `capacity` slots, in beam order.
+      The primitives in `capacity` slots, in beam order. Between circles there may be free slots.
 
     Raises:
       ValueError: at trace time, for an option that does not exist.
     """
     dtype = scan.ranges.dtype
-    thresholds, noise, mount, pose = as_dtype((thresholds or Thresholds(), noise or SensorNoise(), mount or Mount(), pose), dtype)
-    if segmentation != "incremental":
-        raise ValueError(f"segmentation must be 'incremental', not {segmentation!r}")
-
-    finite = jnp.all(jnp.isfinite(pose.mean)) & jnp.all(jnp.isfinite(pose.cov))
-    scan = dataclasses.replace(scan, valid=scan.valid & finite)
-    pose = jax.tree.map(lambda x: jnp.where(finite, x, 0), pose)
+    defaults = (thresholds or Thresholds(), noise or SensorNoise(), mount or Mount(), pose)
+    thresholds, noise, mount, pose = as_dtype(defaults, dtype)
+    scan, pose, finite = usable(scan, pose)
     points = points_from_scan(scan, pose, mount, jacobians=jacobians)
-    n = scan.ranges.shape[0]
-
-    run, breaks = incremental.segment(points, scan, thresholds, noise, rules)
-    runs = lines_.runs_from_labels(run, n)
-    enough = runs.count >= lines_.MIN_POINTS
-    is_line = enough & lines_.long_enough(points, runs, thresholds)
-    in_line = (run >= 0) & is_line[run]
-    slot, lines_full = slots_in_order(is_line, capacity.lines)
-    of_beam = jnp.where(in_line, slot[run], -1)
-    lines, jac_line_pose, cov_measurement = lines_.measure_lines(
+    found = extract_points(
         points,
-        scan,
         pose,
-        lines_.runs_from_labels(of_beam, capacity.lines),
+        thresholds,
         noise,
+        capacity=capacity,
+        rules=rules,
+        segmentation=segmentation,
         covariance=covariance,
         jacobians=jacobians,
     )
+    return dataclasses.replace(found, status=found.status | jnp.where(finite, 0, int(Status.POSE_NOT_FINITE)))
 
-    clusters = circles_.cluster(points.position, scan.valid, scan.valid & ~in_line, thresholds)
-    found = circles_.measure_circles(points, scan, pose, clusters, thresholds, noise, fit=rules.fit_circles)
-    near = circles_.near_lines(found, lines, thresholds)
-    is_circle = found.valid & ~near
-    circle_slot, circles_full = slots_in_order(is_circle, capacity.circles)
 
-    def points_in(runs: lines_.Runs, which: Bool[Array, " K"]) -> Int[Array, ""]:
-        return jnp.sum(jnp.where(which, runs.count, 0))
+def usable(scan: Scan, pose: Pose) -> tuple[Scan, Pose, Bool[Array, ""]]:
+    """A scan and a pose without anything that is not finite, and whether the pose was finite.
 
-    status = (
-        jnp.where(finite, 0, int(Status.POSE_NOT_FINITE))
-        | jnp.where(lines_full, int(Status.SCAN_LINES_FULL), 0)
-        | jnp.where(circles_full, int(Status.SCAN_CIRCLES_FULL), 0)
+    What stands in a masked beam may be anything; a scan with a pose that is not finite loses all its beams.
+    """
+    finite = jnp.all(jnp.isfinite(pose.mean)) & jnp.all(jnp.isfinite(pose.cov))
+    valid = scan.valid & finite
+    ranges, bearings = (jnp.where(valid, x, 0) for x in (scan.ranges, scan.bearings))
+    pose = jax.tree.map(lambda x: jnp.where(finite, x, 0), pose)
+    return dataclasses.replace(scan, ranges=ranges, bearings=bearings, valid=valid), pose, finite
+
+
+def extract_points(
+    points: Points,
+    pose: Pose,
+    thresholds: Thresholds,
+    noise: SensorNoise,
+    *,
+    capacity: Capacity,
+    rules: Rules,
+    segmentation: Segmentation,
+    covariance: Covariance,
+    jacobians: Jacobians,
+) -> Extraction:
+    """`extract`, from the points of the scan on."""
+    if segmentation != "incremental":
+        raise ValueError(f"segmentation must be 'incremental', not {segmentation!r}")
+    ends, run, breaks = incremental.segment(points, thresholds, noise, rules)
+    few = run.n < MIN_POINTS
+    short = length_of_run(run, points.position) <= thresholds.min_length
+    runs, lines_full = select_runs(run.n, ends & ~few & ~short, capacity.lines)
+    lines, jac_line_pose, cov_measurement = measure_lines(
+        points, pose, runs, noise, covariance=covariance, jacobians=jacobians
     )
+
+    cluster_ends, cluster = circles_.cluster(points, points.valid & (runs.of_point < 0), thresholds)
+    lone = cluster.n < 2
+    clusters, circles_full = select_runs(cluster.n, cluster_ends & ~lone, capacity.circles)
+    circles = circles_.measure_circles(
+        points, pose, clusters, cluster, thresholds, noise, fit=rules.fit_circles
+    )
+    near = circles_.near_lines(circles, lines, thresholds)
+    circles = dataclasses.replace(circles, valid=circles.valid & ~near)
+
+    def points_of(run: Run | circles_.Cluster, which: Bool[Array, " N"]) -> Int[Array, ""]:
+        return jnp.sum(jnp.where(which, run.n, 0)).astype(jnp.int32)
+
+    status = jnp.where(lines_full, int(Status.SCAN_LINES_FULL), 0)
+    status |= jnp.where(circles_full, int(Status.SCAN_CIRCLES_FULL), 0)
+    in_cluster = clusters.of_point >= 0
+    modelled = circles.valid[clusters.of_point]
     return Extraction(
         lines=lines,
-        circles=_compact(found, circle_slot, capacity.circles),
+        circles=neutral_where_free(circles),
         jac_line_pose=jac_line_pose,
         cov_measurement=cov_measurement,
-        line_of_beam=of_beam,
-        circle_of_beam=jnp.where(clusters.of_beam >= 0, circle_slot[clusters.of_beam], -1),
+        line_of_beam=points.per_beam(runs.of_point),
+        circle_of_beam=points.per_beam(jnp.where(in_cluster & modelled, clusters.of_point, -1)),
         rejected=Rejected(
-            invalid=jnp.sum(~scan.valid, dtype=jnp.int32),
+            invalid=jnp.sum(~points.valid, dtype=jnp.int32),
             gap=breaks[0],
             distance=breaks[1],
             bearing=breaks[2],
-            too_few=points_in(runs, ~enough),
-            too_short=points_in(runs, enough & ~is_line),
-            lone=points_in(clusters, clusters.count == 1),
-            near_line=points_in(clusters, near),
+            too_few=points_of(run, ends & few),
+            too_short=points_of(run, ends & ~few & short),
+            lone=points_of(cluster, cluster_ends & lone),
+            near_line=jnp.sum(in_cluster & ~modelled, dtype=jnp.int32),
         ),
         status=status.astype(jnp.int32),
     )
@@ -129,20 +160,3 @@ def extract(
 def as_dtype(tree: Any, dtype: Any) -> Any:
     """All numbers of a tree as arrays of one dtype: that of the scan, never a hidden default."""
     return jax.tree.map(lambda x: jnp.asarray(x, dtype), tree)
-
-
-def slots_in_order(which: Bool[Array, " M"], capacity: int) -> tuple[Int[Array, " M"], Bool[Array, ""]]:
-    """Slots 0, 1, ... for the chosen items in their order, -1 for the others and for those past the capacity.
-
-    Returns:
-      The slots, shape `[M]`, and whether something was left out.
-    """
-    slot = jnp.cumsum(which) - 1
-    fits = which & (slot < capacity)
-    return jnp.where(fits, slot, -1).astype(jnp.int32), jnp.any(which & ~fits)
-
-
-def _compact(found: Circles, slot: Int[Array, " M"], capacity: int) -> Circles:
-    into = jnp.where(slot < 0, capacity, slot)
-    free = empty_circles(capacity, found.radius.dtype)
-    return jax.tree.map(lambda a, b: a.at[into].set(b, mode="drop"), free, found)

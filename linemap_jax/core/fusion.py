@@ -9,66 +9,64 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from linemap_jax.core.frames import dot, shift_matrix, wrap_angle
 from linemap_jax.core.matching import CircleMatches, compare_lines, with_sign
 from linemap_jax.core.propagation import apply, inverse, product, propagate, symmetric
 from linemap_jax.core.settings import Rules, Thresholds
+from linemap_jax.core.slots import least
 from linemap_jax.core.state import Circles, Lines, pytree
 
 
 @pytree
 class Pieces:
-    """Observed pieces of lines, each with the slot of the map's line that it belongs to."""
+    """Observed pieces of lines."""
 
     lines: Lines
-    target: Int[Array, " L"]  # slot of the map, -1 for none
     cov_measurement: Float[Array, "L 2 2"]  # of (offset, angle), not shared with other pieces
     jac_line_pose: Float[Array, "L 2 3"]  # what they share
 
 
 def fuse_lines(
     model: Lines,
-    has_prior: Bool[Array, " K"],
+    has_prior: Bool[Array, " L"],
     pieces: Pieces,
+    together: Bool[Array, "L L"],
     cov_pose: Float[Array, "3 3"],
     thresholds: Thresholds,
     rules: Rules,
 ) -> Lines:
-    """Eq. (23) for all lines of the map at once, and the end points of section 5.1.2.
+    """Eq. (23) and the end points of section 5.1.2: each piece's line, improved by all pieces that are parts of it.
 
     Args:
-      model: the lines of the map. A new line stands in its slot already, as the point to linearise at.
-      has_prior: false for such new lines, whose covariance counts for nothing.
-      pieces: what was observed; each line of the map takes the pieces that name its slot.
+      model: for each piece the line that it belongs to. A line that is new is the piece that leads its group: the point
+        to linearise at.
+      has_prior: false for new lines, whose covariance counts for nothing.
+      pieces: what was observed.
+      together: which pieces belong to one line; such pieces have the same `model`, and get the same result.
       cov_pose: covariance of the pose that the pieces share.
       thresholds: `end_sigmas`.
       rules: `estimate_ends`.
 
     Returns:
-      The lines of the map; those without a piece are as they were.
+      The improved lines, one for each piece. Rows of `together` that are empty give nonsense.
     """
-    k = model.valid.shape[0]
-    at = jnp.maximum(pieces.target, 0)
-    into = jnp.where(pieces.target < 0, k, pieces.target)
+    count = has_prior.shape[0]
 
-    def total(per_piece: Array) -> Array:
-        return jax.ops.segment_sum(per_piece, into, k)
-
-    def in_map(piece: Lines, line: Lines, cov: Array, jac: Array) -> tuple[Array, Array, Array]:
-        """Information of one piece about its line, at the line's anchor: matrix, vector, and what the pose adds."""
+    def in_map(piece: Lines, line: Lines, cov: Array, jac: Array) -> Array:
+        """Information of one piece about its line, at the line's anchor: matrix, what the pose adds, vector."""
         pair = compare_lines(piece, line, thresholds)
         shift = shift_matrix(pair.lever)
         weight = product(shift.T, inverse(with_sign(cov, pair.sign)))
         turned = jac * jnp.stack([pair.sign, jnp.ones_like(pair.sign)])[:, None]
         innovation = jnp.stack([pair.offset, pair.angle])
-        return product(weight, shift), apply(weight, innovation), product(weight, turned)
+        return jnp.concatenate([product(weight, shift), product(weight, turned), apply(weight, innovation)[:, None]], -1)
 
-    mine = jax.tree.map(lambda x: x[at], model)
-    parts = jax.vmap(in_map)(pieces.lines, mine, pieces.cov_measurement, pieces.jac_line_pose)
-    information, vector, by_pose = (total(part) for part in parts)
-    touched = total(jnp.ones_like(into)) > 0
+    parts = jax.vmap(in_map)(pieces.lines, model, pieces.cov_measurement, pieces.jac_line_pose)
+    member = together.astype(parts.dtype)
+    total = jnp.dot(member, parts.reshape(count, -1), precision=jax.lax.Precision.HIGHEST).reshape(parts.shape)
+    information, by_pose, vector = total[..., :2], total[..., 2:5], total[..., 5]
 
     cov_measurement = inverse(information)
     seen = apply(cov_measurement, vector)
@@ -77,7 +75,6 @@ def fuse_lines(
     prior = jnp.where(has_prior[:, None, None], inverse(model.cov), 0)
     cov = symmetric(inverse(prior + information_seen))
     change = apply(cov, apply(information_seen, seen))
-
     fused = dataclasses.replace(
         model,
         offset=model.offset + change[:, 0],
@@ -85,12 +82,16 @@ def fuse_lines(
         cov=cov,
         times_detected=jnp.where(has_prior, model.times_detected + 1, 1),
     )
-    fused = _fuse_ends(fused, has_prior, pieces, thresholds, rules)
-    return jax.tree.map(lambda a, b: jnp.where(touched.reshape((k,) + (1,) * (a.ndim - 1)), a, b), fused, model)
+    return _fuse_ends(fused, has_prior, pieces, together, thresholds, rules)
 
 
 def _fuse_ends(
-    model: Lines, has_prior: Bool[Array, " K"], pieces: Pieces, thresholds: Thresholds, rules: Rules
+    model: Lines,
+    has_prior: Bool[Array, " L"],
+    pieces: Pieces,
+    together: Bool[Array, "L L"],
+    thresholds: Thresholds,
+    rules: Rules,
 ) -> Lines:
     """The end points of section 5.1.2: those of the pieces are projected on the new line and held against the old ones.
 
@@ -98,19 +99,17 @@ def _fuse_ends(
     scans at 5 cm of pose error). By default end points that agree within their spread are averaged by their variances;
     an observed end well beyond the old one replaces it, and one well short of it (the rest was hidden) does nothing.
     """
-    k = model.valid.shape[0]
-    at = jnp.maximum(pieces.target, 0)
-    into = jnp.where(pieces.target < 0, k, pieces.target)
-    anchor, tangent = model.anchor[at], model.tangent[at]
-    along = jnp.stack([dot(tangent, end - anchor) for end in (pieces.lines.begin, pieces.lines.end)], -1)
+    tangent = model.tangent
+    along = jnp.stack([dot(tangent, end - model.anchor) for end in (pieces.lines.begin, pieces.lines.end)], -1)
 
     def outermost(direction: int, old: Array, var_old: Array) -> tuple[Array, Array]:
         """The lower end for direction -1, the upper one for +1, in coordinates in which larger is longer."""
-        seen = direction * along
-        mine = jnp.max(seen, -1)
-        var = jnp.where(seen[:, 0] == mine, pieces.lines.var_extent[:, 0], pieces.lines.var_extent[:, 1])
-        new = jax.ops.segment_max(mine, into, k)
-        var_new = jax.ops.segment_min(jnp.where(mine == new[at], var, jnp.inf), into, k)
+        reach = direction * along
+        second = reach[:, 1] > reach[:, 0]
+        mine = jnp.where(second, reach[:, 1], reach[:, 0])
+        var_mine = jnp.where(second, pieces.lines.var_extent[:, 1], pieces.lines.var_extent[:, 0])
+        piece, new = least(jnp.where(together, -mine[None], jnp.inf))
+        new, var_new = -new, var_mine[piece]
         old = direction * old
         longer = new > old
         if rules.estimate_ends:

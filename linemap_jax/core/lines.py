@@ -14,42 +14,15 @@ from jaxtyping import Array, Bool, Float, Int
 
 from linemap_jax.core.frames import dot, perp, shift_matrix, wrap_angle
 from linemap_jax.core.propagation import product, propagate, quadratic, symmetric
+from linemap_jax.core.runs import Runs
+from linemap_jax.core.segmentation.incremental import Run
 from linemap_jax.core.sensor import Points, cov_point
-from linemap_jax.core.settings import Covariance, Jacobians, SensorNoise, Thresholds
-from linemap_jax.core.state import Lines, Pose, Scan, neutral_where_free, pytree
+from linemap_jax.core.settings import Covariance, Jacobians, SensorNoise
+from linemap_jax.core.slots import neutral_where_free
+from linemap_jax.core.state import Lines, Pose, pytree
 
 MIN_POINTS = 3
 """At least three points are necessary to define a line (s4.3.1)."""
-
-
-@pytree
-class Runs:
-    """Runs of points, one after the other in beam order. `K` slots; a run without points is free."""
-
-    of_beam: Int[Array, " N"]  # slot of each beam's run, -1 for none
-    count: Int[Array, " K"]  # points
-    first: Int[Array, " K"]  # beam of the first point, 0 for a free slot
-    last: Int[Array, " K"]  # beam of the last point, 0 for a free slot
-
-    def sum(self, per_point: Float[Array, "N *s"]) -> Float[Array, "K *s"]:
-        """Sum over the points of each run."""
-        return jax.ops.segment_sum(per_point, _or_past_end(self), self.count.shape[0])
-
-    def spread(self, per_run: Float[Array, "K *s"]) -> Float[Array, "N *s"]:
-        """The value of each point's run; that of slot 0 for points of no run."""
-        return per_run[jnp.maximum(self.of_beam, 0)]
-
-
-def runs_from_labels(of_beam: Int[Array, " N"], capacity: int) -> Runs:
-    """Runs from the slot of each beam. Labels must not decrease along the beams, -1 (none) aside."""
-    n = of_beam.shape[0]
-    slot = jnp.where(of_beam < 0, capacity, of_beam)
-    index = jnp.arange(n)
-    count = jax.ops.segment_sum(jnp.ones(n, jnp.int32), slot, capacity)
-    first = jax.ops.segment_min(index, slot, capacity)
-    last = jax.ops.segment_max(index, slot, capacity)
-    used = count > 0
-    return Runs(of_beam=of_beam, count=count, first=jnp.where(used, first, 0), last=jnp.where(used, last, 0))
 
 
 @pytree
@@ -82,8 +55,9 @@ def regress(position: Float[Array, "N 2"], runs: Runs) -> Regression:
     origin = jax.lax.stop_gradient(position[runs.first])
     x, y = jnp.moveaxis(position - runs.spread(origin), -1, 0)
     # Eq. (5)
-    rx, ry, rxx, ryy, rxy = jnp.moveaxis(runs.sum(jnp.stack([x, y, x * x, y * y, x * y], -1)), -1, 0)
-    n = jnp.maximum(runs.count, 1).astype(x.dtype)
+    sums = runs.sum(jnp.stack([jnp.ones_like(x), x, y, x * x, y * y, x * y], -1))
+    n, rx, ry, rxx, ryy, rxy = jnp.moveaxis(sums, -1, 0)
+    n = jnp.maximum(n, 1)
     # Eq. (6)
     n1, n2 = rxx * n - rx * rx, ryy * n - ry * ry
     t = rxy * n - rx * ry
@@ -143,7 +117,7 @@ def jac_line_points(
     if jacobians == "analytic":
         fit = regress(position, runs)
         jac = jac_regression_points(position, runs, fit, anchor)
-        in_run = (runs.of_beam >= 0)[:, None, None]
+        in_run = (runs.of_point >= 0)[:, None, None]
         return jnp.where(in_run, product(runs.spread(jac_line_regression(fit, anchor)), jac), 0)
     raise ValueError(f"jacobians must be 'autodiff' or 'analytic', not {jacobians!r}")
 
@@ -152,10 +126,12 @@ def jac_regression_points(
     position: Float[Array, "N 2"], runs: Runs, fit: Regression, anchor: Float[Array, "K 2"]
 ) -> Float[Array, "N 2 2"]:
     """J of Eq. (12), derived by hand: d(m, q) / d(x, y), or d(s, t) / d(x, y), with the intercept at the anchor."""
-    n, width, slope, steep = (runs.spread(v) for v in (fit.count, fit.width, fit.slope, fit.steep))
-    mean = runs.spread(fit.origin + fit.centroid)
+    centre = fit.origin + fit.centroid
+    columns = [x[:, None] for x in (fit.count, fit.width, fit.slope, fit.steep.astype(anchor.dtype))]
+    mine = runs.spread(jnp.concatenate([*columns, centre, centre - anchor], -1))
+    n, width, slope, steep = mine[:, 0], mine[:, 1], mine[:, 2], mine[:, 3] > 0
+    mean, lever = mine[:, 4:6], mine[:, 6:8]
     from_mean = n[:, None] * (position - mean)
-    lever = mean - runs.spread(anchor)
     # (u, w): regressor and response; (x, y) for (m, q), (y, x) for (s, t)
     u, w = _regressor_first(from_mean, steep)
     u_mean, _ = _regressor_first(lever, steep)
@@ -195,7 +171,6 @@ def jac_line_regression(fit: Regression, anchor: Float[Array, "K 2"]) -> Float[A
 
 def measure_lines(
     points: Points,
-    scan: Scan,
     pose: Pose,
     runs: Runs,
     noise: SensorNoise,
@@ -212,7 +187,6 @@ def measure_lines(
 
     Args:
       points: the points of the scan.
-      scan: the scan.
       pose: of the robot.
       runs: the runs that are lines; free slots give free lines.
       noise: of the sensor.
@@ -232,17 +206,15 @@ def measure_lines(
 
     jac = jac_line_points(points.position, runs, anchor, jacobians=jacobians)
     sigma = jnp.stack([noise.range_sigma, noise.bearing_sigma])
-    from_noise = product(jac, points.jac_point_measurement) * sigma[None, None]
-    from_pose = product(jac, points.jac_point_pose)
-    cov_measurement = runs.sum(product(from_noise, jnp.swapaxes(from_noise, -1, -2)))
-    if covariance == "exact":
-        jac_line_pose = runs.sum(from_pose)
-    elif covariance == "printed":
-        cov_measurement = cov_measurement + runs.sum(propagate(from_pose, pose.cov))
-        jac_line_pose = jnp.zeros_like(runs.sum(from_pose))
-    else:
+    from_noise = product(jac, points.jac_measurement) * sigma[None, None]
+    from_pose = product(jac, points.jac_pose)
+    spread = product(from_noise, jnp.swapaxes(from_noise, -1, -2))
+    if covariance == "printed":
+        spread, from_pose = spread + propagate(from_pose, pose.cov), jnp.zeros_like(from_pose)
+    elif covariance != "exact":
         raise ValueError(f"covariance must be 'exact' or 'printed', not {covariance!r}")
-    cov_measurement = symmetric(cov_measurement)
+    sums = runs.sum(jnp.concatenate([spread, from_pose], -1))
+    cov_measurement, jac_line_pose = symmetric(sums[..., :2]), sums[..., 2:]
 
     lines = Lines(
         anchor=anchor_world,
@@ -250,9 +222,9 @@ def measure_lines(
         angle=angle,
         cov=cov_measurement + propagate(jac_line_pose, pose.cov),
         extent=extent,
-        var_extent=_var_extent(points, scan, pose, runs, angle, noise),
-        times_detected=jnp.ones_like(runs.count),
-        valid=runs.count > 0,
+        var_extent=_var_extent(points, pose, runs, angle, noise),
+        times_detected=jnp.ones_like(runs.first),
+        valid=runs.valid,
     )
     return neutral_where_free(lines), jac_line_pose, cov_measurement
 
@@ -265,17 +237,28 @@ def line_extent(
     return jnp.stack([dot(tangent, position[i] - anchor) for i in (runs.first, runs.last)], -1)
 
 
-def long_enough(points: Points, runs: Runs, thresholds: Thresholds) -> Bool[Array, " K"]:
-    """Section 4.3.1: is the segment of a run longer than the shortest line that is modelled?"""
-    fit = regress(points.position, runs)
-    anchor = fit.origin + fit.centroid
-    _, angle = line_from_regression(fit, anchor)
-    begin, end = jnp.moveaxis(line_extent(points.position, runs, anchor, angle), -1, 0)
-    return end - begin > thresholds.min_length
+def length_of_run(run: Run, position: Float[Array, "N 2"]) -> Float[Array, " N"]:
+    """The length of the segment that a run would give, for the rule of s4.3.1.
+
+    Args:
+      run: the runs as they stood at each point.
+      position: that point, their last one. Shape `[N, 2]`.
+
+    Returns:
+      Lengths in metres. Shape `[N]`.
+    """
+    n1, n2 = run.rxx * run.n - run.rx * run.rx, run.ryy * run.n - run.ry * run.ry
+    t = run.rxy * run.n - run.rx * run.ry
+    steep = n1 < n2
+    width = jnp.where(steep, n2, n1)
+    slope = t / jnp.where(width > 0, width, 1)
+    x, y = position[:, 0] - run.x0, position[:, 1] - run.y0
+    along = jnp.where(steep, y + slope * x, x + slope * y)
+    return jnp.abs(along) / jnp.sqrt(1 + slope * slope)
 
 
 def _var_extent(
-    points: Points, scan: Scan, pose: Pose, runs: Runs, angle: Float[Array, " K"], noise: SensorNoise
+    points: Points, pose: Pose, runs: Runs, angle: Float[Array, " K"], noise: SensorNoise
 ) -> Float[Array, "K 2"]:
     """Variance of the end points along the line, m^2.
 
@@ -284,15 +267,14 @@ def _var_extent(
     """
     tangent = jnp.stack([-jnp.sin(angle), jnp.cos(angle)], -1)
     normal = -perp(tangent)
-    cov = cov_point(points, pose, noise)
 
-    def at(beam: Int[Array, " K"]) -> Float[Array, " K"]:
-        from_point = quadratic(tangent, cov[beam])
+    def end(at: Int[Array, " K"]) -> Float[Array, " K"]:
+        cov = cov_point(points.jac_pose[at], points.jac_measurement[at], pose.cov, noise)
         # A grazing beam says nothing about the end; 0.1 is 6 degrees.
-        step = scan.spacing * scan.ranges[beam] / jnp.maximum(jnp.abs(dot(normal, points.beam[beam])), 0.1)
-        return from_point + step**2 / 12
+        step = points.spacing * points.range[at] / jnp.maximum(jnp.abs(dot(normal, points.beam[at])), 0.1)
+        return quadratic(tangent, cov) + step**2 / 12
 
-    return jnp.stack([at(runs.first), at(runs.last)], -1)
+    return jnp.stack([end(runs.first), end(runs.last)], -1)
 
 
 def rho_theta(lines: Lines) -> tuple[Float[Array, " K"], Float[Array, " K"], Float[Array, "K 2 2"]]:
@@ -320,8 +302,3 @@ def rho_theta(lines: Lines) -> tuple[Float[Array, " K"], Float[Array, " K"], Flo
 def _regressor_first(vector: Float[Array, "M 2"], steep: Bool[Array, " M"]) -> tuple[Array, Array]:
     x, y = vector[:, 0], vector[:, 1]
     return jnp.where(steep, y, x), jnp.where(steep, x, y)
-
-
-def _or_past_end(runs: Runs) -> Int[Array, " N"]:
-    """Slots for a segment sum: -1 would count from the end, one past the end is dropped."""
-    return jnp.where(runs.of_beam < 0, runs.count.shape[0], runs.of_beam)

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Int
 
 from linemap_jax.core import fusion, matching, wiping
 from linemap_jax.core.circles import near_lines
-from linemap_jax.core.extract import as_dtype, extract
+from linemap_jax.core.extract import as_dtype, extract_points, usable
 from linemap_jax.core.sensor import Points, points_from_scan
 from linemap_jax.core.settings import (
     SCAN_CAPACITY,
@@ -27,6 +27,7 @@ from linemap_jax.core.settings import (
     SensorNoise,
     Thresholds,
 )
+from linemap_jax.core.slots import choose, first_true, free_slots, neutral_where_free, put, take
 from linemap_jax.core.state import (
     LEFT_OUT,
     NEW,
@@ -37,11 +38,9 @@ from linemap_jax.core.state import (
     Pose,
     Report,
     Scan,
-    SlotsT,
     Status,
     empty_circles,
     empty_lines,
-    neutral_where_free,
 )
 
 
@@ -91,31 +90,27 @@ def update(
     dtype = scan.ranges.dtype
     if line_map.lines.cov.dtype != dtype:
         raise ValueError(f"the map is {line_map.lines.cov.dtype} and the scan {dtype}; make both the same")
-    thresholds, noise, mount, pose = as_dtype(
-        (thresholds or Thresholds(), noise or SensorNoise(), mount or Mount(), pose), dtype
-    )
-    found = extract(
-        scan,
+    defaults = (thresholds or Thresholds(), noise or SensorNoise(), mount or Mount(), pose)
+    thresholds, noise, mount, pose = as_dtype(defaults, dtype)
+    scan, pose, finite = usable(scan, pose)
+    points = points_from_scan(scan, pose, mount, jacobians=jacobians)
+    found = extract_points(
+        points,
         pose,
-        thresholds=thresholds,
-        noise=noise,
-        mount=mount,
+        thresholds,
+        noise,
         capacity=capacity,
         rules=rules,
         segmentation=segmentation,
         covariance=covariance,
         jacobians=jacobians,
     )
-    usable = (found.status & int(Status.POSE_NOT_FINITE)) == 0
-    scan = dataclasses.replace(scan, valid=scan.valid & usable)
-    pose = jax.tree.map(lambda x: jnp.where(usable, x, 0), pose)
-    points = points_from_scan(scan, pose, mount, jacobians=jacobians)
 
     lines = _update_lines(line_map.lines, found, pose, thresholds, rules)
-    swept = _sweep(line_map.circles, lines, found, points, scan, pose, thresholds, noise, rules)
+    swept = _sweep(line_map.circles, lines, found, points, pose, thresholds, noise, rules)
     circles = _update_circles(line_map.circles, found, swept.lines, lines.targets, swept.gone, thresholds, rules)
 
-    status = found.status
+    status = found.status | jnp.where(finite, 0, int(Status.POSE_NOT_FINITE))
     status |= jnp.where(lines.overflow | swept.wiped.overflow, int(Status.MAP_LINES_FULL), 0)
     status |= jnp.where(circles.overflow, int(Status.MAP_CIRCLES_FULL), 0)
     report = Report(
@@ -165,26 +160,25 @@ def _update_lines(
     unmatched = new.valid & (match.slot < 0) & (match.suspect < 0)
     leader = matching.group_lines(new, cov_measurement, unmatched, thresholds)
 
-    # Leaders take free slots, where they stand as the point to linearise at; their group is fused into them.
-    k = model.valid.shape[0]
+    has_prior = match.slot >= 0
     leads = leader == jnp.arange(leader.shape[0])
-    slot_of_leader, overflow = _free_slots(leads, model.valid)
-    model, before = _put(model, new, slot_of_leader), model
-    targets = jnp.where(leader >= 0, slot_of_leader[jnp.maximum(leader, 0)], match.slot)
-    pieces = fusion.Pieces(
-        lines=new, target=targets, cov_measurement=cov_measurement, jac_line_pose=jac_line_pose
-    )
-    model = fusion.fuse_lines(model, before.valid, pieces, pose.cov, thresholds, rules)
+    slot_of_leader, overflow = free_slots(leads, model.valid)
+    targets = jnp.where(has_prior, match.slot, jnp.where(leader >= 0, slot_of_leader[leader], -1))
+    mine = choose(has_prior, take(model, match.slot), take(new, leader))
+    together = (targets[:, None] == targets[None]) & (targets >= 0)[None]
+    pieces = fusion.Pieces(lines=new, cov_measurement=cov_measurement, jac_line_pose=jac_line_pose)
+    fused = fusion.fuse_lines(mine, has_prior, pieces, together, pose.cov, thresholds, rules)
+    # All pieces of a line have the same result; the first one writes it.
+    first = (targets >= 0) & (jax.vmap(first_true)(together) == jnp.arange(targets.shape[0]))
+    model = put(model, jnp.where(first, targets, -1), fused)
 
-    is_target = jnp.zeros(k, bool).at[jnp.where(targets < 0, k, targets)].set(True, mode="drop")
-    fused = jnp.sum(is_target & before.valid, dtype=jnp.int32)
     slot = jnp.where(leader >= 0, NEW, match.slot)
     slot = jnp.where(targets < 0, LEFT_OUT, slot)
     merged = jnp.zeros((), jnp.int32)
     if rules.merge:
-        model, moved, merged = _merge(model, targets, thresholds, rules)
-        targets = jnp.where(targets >= 0, moved[jnp.maximum(targets, 0)], targets)
-        slot = jnp.where(slot >= 0, moved[jnp.maximum(slot, 0)], slot)
+        model, moved, merged = _merge(model, fused, jnp.where(first, targets, -1), thresholds, rules)
+        targets = jnp.where(targets >= 0, moved[targets], targets)
+        slot = jnp.where(slot >= 0, moved[slot], slot)
     return _LineUpdate(
         model=model,
         targets=targets,
@@ -193,69 +187,57 @@ def _update_lines(
         nis=match.nis,
         dof=jnp.where(match.compared, 2, 0).astype(jnp.int32),
         added=jnp.sum(slot_of_leader >= 0, dtype=jnp.int32),
-        fused=fused,
+        fused=jnp.sum(first & has_prior, dtype=jnp.int32),
         merged=merged,
         overflow=overflow,
     )
 
 
 def _merge(
-    model: Lines, targets: Int[Array, " L"], thresholds: Thresholds, rules: Rules
+    model: Lines, touched: Lines, slots: Int[Array, " L"], thresholds: Thresholds, rules: Rules
 ) -> tuple[Lines, Int[Array, " K"], Int[Array, ""]]:
     """Join lines of the map that overlap and agree, where this scan touched one of them.
 
-    The lower slot stays. A line is joined with one other at most; of rival pairs the one with the least NIS is taken.
+    A line is joined with one other at most; of rival pairs the one with the least NIS is taken. The lower slot stays.
+
+    Args:
+      model: the lines of the map.
+      touched: the lines that this scan touched, as they now are.
+      slots: where they stand, -1 for those that are not meant.
+      thresholds: `match_...`.
+      rules: which reading of the method.
 
     Returns:
       The lines; for each slot where its line now stands; how many were joined.
     """
     k = model.valid.shape[0]
-    index = jnp.arange(targets.shape[0])
-    earlier = (targets[:, None] == targets[None]) & (index[None] < index[:, None])
-    asks = (targets >= 0) & ~jnp.any(earlier, -1)
-    at = jnp.maximum(targets, 0)
-    touched = jax.tree.map(lambda x: x[at], model)
+    everywhere = jnp.arange(k, dtype=jnp.int32)
+    others = (slots >= 0)[:, None] & (everywhere[None] != slots[:, None])
+    partner, nis = matching.best_line(touched, model, thresholds, among=others, overlapping=True)
+    some = nis < thresholds.match_nis
 
-    # The line in the lower slot plays the map's part, whichever of the two was touched.
-    as_new = matching.compare_all(touched, model, thresholds)
-    as_model = jax.vmap(jax.vmap(matching.compare_lines, (0, None, None)), (None, 0, None))(model, touched, thresholds)
-    slots = jnp.arange(k, dtype=jnp.int32)
-    lower = slots[None] < at[:, None]
-    pair = jax.tree.map(
-        lambda a, b: jnp.where(lower.reshape(lower.shape + (1,) * (a.ndim - 2)), a, b), as_new, as_model
-    )
-    agree = pair.geometric & (pair.nis < thresholds.match_nis) & (pair.gap < 0)
-    partner, nis, some = matching.least(pair.nis, agree & (slots[None] != at[:, None]) & asks[:, None])
-
-    low, high = jnp.minimum(at, partner), jnp.maximum(at, partner)
-    shared = (
-        (low[:, None] == low[None])
-        | (low[:, None] == high[None])
-        | (high[:, None] == low[None])
-        | (high[:, None] == high[None])
-    )
+    pair = jnp.stack([slots, partner], -1)
+    shared = jnp.any(pair[:, None, :, None] == pair[None, :, None, :], (-1, -2))
+    index = jnp.arange(slots.shape[0])
     better = (nis[None] < nis[:, None]) | ((nis[None] == nis[:, None]) & (index[None] < index[:, None]))
     accepted = some & ~jnp.any(shared & better & some[None], -1)
 
-    gone = jnp.where(accepted, high, k)
-    other = jax.tree.map(lambda x: x[high], model)
+    other = take(model, partner)
+    swap = partner < slots
+    stays, goes = choose(swap, other, touched), choose(swap, touched, other)
     pieces = fusion.Pieces(
-        lines=other,
-        target=jnp.where(accepted, low, -1),
-        cov_measurement=other.cov,
-        jac_line_pose=jnp.zeros((*other.valid.shape, 2, 3), other.cov.dtype),
+        lines=goes, cov_measurement=goes.cov, jac_line_pose=jnp.zeros((*slots.shape, 2, 3), goes.cov.dtype)
     )
-    # Both are estimates of the whole wall: the longer one knows its ends.
+    # Both are estimates of the whole wall: the one that reaches farther knows the end.
     longest = dataclasses.replace(rules, estimate_ends=False)
-    joined = fusion.fuse_lines(model, model.valid, pieces, jnp.zeros((3, 3), other.cov.dtype), thresholds, longest)
-    times = model.times_detected.at[pieces.target].max(other.times_detected, mode="drop")
-    joined = dataclasses.replace(
-        joined,
-        times_detected=times,
-        valid=joined.valid.at[gone].set(False, mode="drop"),
-    )
-    moved = slots.at[gone].set(low.astype(jnp.int32), mode="drop")
-    return neutral_where_free(joined), moved, jnp.sum(accepted, dtype=jnp.int32)
+    no_pose = jnp.zeros((3, 3), goes.cov.dtype)
+    joined = fusion.fuse_lines(stays, accepted, pieces, jnp.diag(accepted), no_pose, thresholds, longest)
+    joined = dataclasses.replace(joined, times_detected=jnp.maximum(stays.times_detected, goes.times_detected))
+    low, high = jnp.min(pair, -1), jnp.max(pair, -1)
+    model = put(model, jnp.where(accepted, low, -1), joined)
+    gone = jnp.where(accepted, high, k)
+    model = dataclasses.replace(model, valid=model.valid.at[gone].set(False, mode="drop"))
+    return model, everywhere.at[gone].set(low, mode="drop"), jnp.sum(accepted, dtype=jnp.int32)
 
 
 class _Sweep(NamedTuple):
@@ -271,7 +253,6 @@ def _sweep(
     lines: _LineUpdate,
     found: Extraction,
     points: Points,
-    scan: Scan,
     pose: Pose,
     thresholds: Thresholds,
     noise: SensorNoise,
@@ -279,7 +260,8 @@ def _sweep(
 ) -> _Sweep:
     """Section 6: by beams or by triangles."""
     if rules.wipe_by_beams:
-        swath = wiping.swath_of_scan(points, scan, pose, found.line_of_beam, found.lines, lines.own, thresholds)
+        line_of_point = jnp.where(points.valid, found.line_of_beam[points.index], -1)
+        swath = wiping.swath_of_scan(points, pose, line_of_point, found.lines, lines.own, thresholds)
         model, wiped = wiping.wipe_lines(
             lines.model,
             lambda line, slot: wiping.passed_through(line, slot, swath, pose.cov, thresholds, noise),
@@ -327,12 +309,11 @@ def _update_circles(
     model = dataclasses.replace(model, valid=model.valid & ~gone)
 
     fresh = new.valid & (match.slot < 0) & ~match.ambiguous & ~near_lines(new, lines, thresholds)
-    slot, overflow = _free_slots(fresh, model.valid)
-    model = _put(model, new, slot)
+    slot, overflow = free_slots(fresh, model.valid)
+    model = put(model, slot, new)
 
     # Only lines that this scan touched can have come near a circle.
-    at = jnp.maximum(targets, 0)
-    touched = jax.tree.map(lambda x: x[at], lines)
+    touched = take(lines, targets)
     touched = dataclasses.replace(touched, valid=touched.valid & (targets >= 0))
     near = near_lines(model, touched, thresholds)
     model = dataclasses.replace(model, valid=model.valid & ~near)
@@ -347,18 +328,3 @@ def _update_circles(
         deleted=jnp.sum(gone, dtype=jnp.int32) + jnp.sum(near, dtype=jnp.int32),
         overflow=overflow,
     )
-
-
-def _free_slots(wanted: Bool[Array, " M"], taken: Bool[Array, " K"]) -> tuple[Int[Array, " M"], Bool[Array, ""]]:
-    """A free slot for each that wants one, the lowest first, -1 where there is none; and whether that happened."""
-    k, m = taken.shape[0], wanted.shape[0]
-    free = jnp.nonzero(~taken, size=m, fill_value=k)[0]
-    slot = free[jnp.maximum(jnp.cumsum(wanted) - 1, 0)]
-    fits = wanted & (slot < k)
-    return jnp.where(fits, slot, -1).astype(jnp.int32), jnp.any(wanted & ~fits)
-
-
-def _put(model: SlotsT, new: SlotsT, slot: Int[Array, " M"]) -> SlotsT:
-    """The new primitives in their slots of the map; those with slot -1 are left out."""
-    into = jnp.where(slot < 0, model.valid.shape[0], slot)
-    return jax.tree.map(lambda a, b: a.at[into].set(b, mode="drop"), model, new)

@@ -13,12 +13,13 @@ from jaxtyping import Array, Bool, Float, Int
 from linemap_jax.core.frames import dot, wrap_angle
 from linemap_jax.core.propagation import inverse, quadratic
 from linemap_jax.core.settings import Rules, Thresholds
+from linemap_jax.core.slots import least, take
 from linemap_jax.core.state import Circles, Lines, pytree
 
 
 @pytree
 class LineComparison:
-    """A new line held against one of the map."""
+    """A new line held against one of the map. No batch axis."""
 
     offset: Float[Array, ""]  # innovation, new minus map, at the anchor of the new line, m
     angle: Float[Array, ""]  # innovation, rad
@@ -78,10 +79,38 @@ def compare_lines(new: Lines, model: Lines, thresholds: Thresholds) -> LineCompa
     )
 
 
-def compare_all(new: Lines, model: Lines, thresholds: Thresholds) -> LineComparison:
-    """Every new line against every line of the map. Each field gets the leading axes `[L, K]`."""
-    by_model = jax.vmap(compare_lines, (None, 0, None))
-    return jax.vmap(by_model, (0, None, None))(new, model, thresholds)
+def best_line(
+    new: Lines,
+    model: Lines,
+    thresholds: Thresholds,
+    *,
+    among: Bool[Array, "L K"] | None = None,
+    overlapping: bool = False,
+) -> tuple[Int[Array, " L"], Float[Array, " L"]]:
+    """For each new line the geometric match with the least normalised distance.
+
+    Among several the paper does not say which to take.
+
+    Args:
+      new: `L` new lines.
+      model: `K` lines of the map.
+      thresholds: `match_...`.
+      among: the pairs that are considered; all unless given.
+      overlapping: whether the segments must overlap.
+
+    Returns:
+      The slot in the map, and the normalised distance of Eq. (21), before the gate of Eq. (22); infinity where there is
+      no match.
+    """
+
+    def score(a: Lines, b: Lines) -> Float[Array, ""]:
+        pair = compare_lines(a, b, thresholds)
+        counts = pair.geometric & (pair.gap < 0) if overlapping else pair.geometric
+        return jnp.where(counts, pair.nis, jnp.inf)
+
+    by_model = jax.vmap(score, (None, 0))
+    nis = jax.vmap(by_model, (0, None))(new, model)
+    return least(nis if among is None else jnp.where(among, nis, jnp.inf))
 
 
 def normal_variance(cov: Float[Array, "2 2"], along: Float[Array, "*s"]) -> Float[Array, "*s"]:
@@ -93,15 +122,6 @@ def with_sign(cov: Float[Array, "*s 2 2"], sign: Float[Array, "*s"]) -> Float[Ar
     """Covariance of (sign offset, angle)."""
     one = jnp.ones_like(sign)
     return cov * jnp.stack([jnp.stack([one, sign], -1), jnp.stack([sign, one], -1)], -2)
-
-
-def least(
-    nis: Float[Array, "L K"], candidates: Bool[Array, "L K"]
-) -> tuple[Int[Array, " L"], Float[Array, " L"], Bool[Array, " L"]]:
-    """The candidate with the least NIS: its slot, its NIS (0 for none), and whether there is one."""
-    masked = jnp.where(candidates, nis, jnp.inf)
-    some = jnp.any(candidates, -1)
-    return jnp.argmin(masked, -1).astype(jnp.int32), jnp.where(some, jnp.min(masked, -1), 0), some
 
 
 @pytree
@@ -117,20 +137,21 @@ class LineMatches:
 def match_lines(new: Lines, model: Lines, thresholds: Thresholds, rules: Rules) -> LineMatches:
     """Find for each new line the line of the map that it is: section 5.1.1.
 
-    Among several candidates the one with the least normalised distance is taken; the paper does not say.
-
     Args:
       new: the lines of a scan.
       model: the lines of the map.
       thresholds: `match_...`.
       rules: `leave_out_ambiguous`.
     """
-    pair = compare_all(new, model, thresholds)
-    slot, _, matched = least(pair.nis, pair.geometric & (pair.nis < thresholds.match_nis))
-    nearest, nis, compared = least(pair.nis, pair.geometric)
+    slot, nis = best_line(new, model, thresholds)
+    compared = jnp.isfinite(nis)
+    matched = nis < thresholds.match_nis
     ambiguous = compared & ~matched & rules.leave_out_ambiguous
     return LineMatches(
-        slot=jnp.where(matched, slot, -1), suspect=jnp.where(ambiguous, nearest, -1), nis=nis, compared=compared
+        slot=jnp.where(matched, slot, -1),
+        suspect=jnp.where(ambiguous, slot, -1),
+        nis=jnp.where(compared, nis, 0),
+        compared=compared,
     )
 
 
@@ -152,14 +173,15 @@ def group_lines(
       The slot of the leader, its own for a leader, -1 for lines that are not unmatched. Shape `[L]`.
     """
     with_cov = dataclasses.replace(new, cov=cov)
-    pair = compare_all(with_cov, with_cov, thresholds)
-    candidate = pair.geometric & (pair.nis < thresholds.match_nis)
+    by_model = jax.vmap(compare_lines, (None, 0, None))
+    pair = jax.vmap(by_model, (0, None, None))(with_cov, with_cov, thresholds)
+    nis = jnp.where(pair.geometric & (pair.nis < thresholds.match_nis), pair.nis, jnp.inf)
     index = jnp.arange(unmatched.shape[0])
 
     def step(i: Array, leader: Array) -> Array:
-        ok = candidate[i] & (leader == index)  # only lines before i lead yet
-        first = jnp.argmin(jnp.where(ok, pair.nis[i], jnp.inf))
-        mine = jnp.where(jnp.any(ok), first, i)
+        distance = jnp.where(leader == index, nis[i], jnp.inf)  # only lines before i lead yet
+        best, value = least(distance[None])
+        mine = jnp.where(jnp.isfinite(value[0]), best[0], i)
         return leader.at[i].set(jnp.where(unmatched[i], mine, -1))
 
     return jax.lax.fori_loop(0, index.shape[0], step, jnp.full(index.shape, -1, index.dtype)).astype(jnp.int32)
@@ -186,11 +208,10 @@ def match_circles(new: Circles, model: Circles, thresholds: Thresholds, rules: R
     step = new.center[:, None] - model.center[None]
     near = new.valid[:, None] & model.valid[None]
     distance = jnp.where(near, jnp.sqrt(dot(step, step)), jnp.inf)
-    slot = jnp.argmin(distance, -1).astype(jnp.int32)
-    distance = jnp.min(distance, -1)
+    slot, distance = least(distance)
     near = distance < thresholds.circle_match_distance
 
-    mine = jax.tree.map(lambda x: x[slot], model)
+    mine = take(model, slot)
     both = near & new.fitted & mine.fitted
     change = jnp.concatenate([new.center - mine.center, (new.radius - mine.radius)[:, None]], -1)
     cov = jnp.where(both[:, None, None], new.cov + mine.cov, jnp.eye(3, dtype=change.dtype)[None])

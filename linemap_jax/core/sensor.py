@@ -6,23 +6,36 @@ precision in float32 a few hundred metres from the origin.
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from linemap_jax.core.frames import perp, rotate, unit
 from linemap_jax.core.propagation import jacobian, propagate
 from linemap_jax.core.settings import Jacobians, Mount, SensorNoise
+from linemap_jax.core.slots import all_true
 from linemap_jax.core.state import Pose, Scan, pytree
 
 
 @pytree
 class Points:
-    """The points of a scan, relative to the robot's position and in the axes of the world."""
+    """The returns of a scan as points, without gaps: those of the first beams that returned stand first.
+
+    Positions are relative to the robot's, in the axes of the world.
+    """
 
     position: Float[Array, "N 2"]  # m
     beam: Float[Array, "N 2"]  # unit vector along the beam
+    range: Float[Array, " N"]  # m
+    turn: Float[Array, " N"]  # rad, angle to the beam of the point before, 0 for the first
+    valid: Bool[Array, " N"]  # true for the returns, which stand first
+    index: Int[Array, " N"]  # beam of the scan, `N` where there is no return
+    jac_pose: Float[Array, "N 2 3"]  # F of Eq. (4)
+    jac_measurement: Float[Array, "N 2 2"]  # G of Eq. (4), with respect to (range, bearing)
     laser: Float[Array, "2"]  # m, the scanner
-    jac_point_pose: Float[Array, "N 2 3"]  # F of Eq. (4)
-    jac_point_measurement: Float[Array, "N 2 2"]  # G of Eq. (4), with respect to (range, bearing)
+    spacing: Float[Array, ""]  # rad, between neighbouring beams
+
+    def per_beam(self, value: Int[Array, " N"]) -> Int[Array, " N"]:
+        """A number of each point as one of each beam of the scan, -1 for beams without a return."""
+        return jnp.full(value.shape, -1, value.dtype).at[self.index].set(value, mode="drop")
 
 
 def point_from_measurement(
@@ -66,17 +79,21 @@ def cov_measurement(noise: SensorNoise) -> Float[Array, "2 2"]:
     return jnp.diag(jnp.stack([jnp.asarray(noise.range_sigma), jnp.asarray(noise.bearing_sigma)]) ** 2)
 
 
-def cov_point(points: Points, pose: Pose, noise: SensorNoise) -> Float[Array, "N 2 2"]:
-    """C_p of Eq. (4) for each point. It holds the pose error that all points of the scan share. m^2."""
-    from_pose = propagate(points.jac_point_pose, pose.cov)
-    return from_pose + propagate(points.jac_point_measurement, cov_measurement(noise))
+def cov_point(
+    jac_pose: Float[Array, "*s 2 3"],
+    jac_measurement: Float[Array, "*s 2 2"],
+    cov_pose: Float[Array, "3 3"],
+    noise: SensorNoise,
+) -> Float[Array, "*s 2 2"]:
+    """C_p of Eq. (4), from F and G, in m^2. It holds the pose error that all points of the scan share."""
+    return propagate(jac_pose, cov_pose) + propagate(jac_measurement, cov_measurement(noise))
 
 
 def points_from_scan(scan: Scan, pose: Pose, mount: Mount, *, jacobians: Jacobians) -> Points:
-    """All points of a scan, with F and G of Eq. (4).
+    """The returns of a scan as points, with F and G of Eq. (4).
 
     Args:
-      scan: `N` beams; masked ones give points that mean nothing.
+      scan: `N` beams.
       pose: of the robot, in the world.
       mount: of the scanner, on the robot.
       jacobians: "autodiff" or "analytic".
@@ -84,7 +101,12 @@ def points_from_scan(scan: Scan, pose: Pose, mount: Mount, *, jacobians: Jacobia
     # The position of the robot is left out: it adds nothing to the derivatives, and takes digits from the points.
     here = pose.mean.at[:2].set(0)
     at = jnp.stack([jnp.asarray(mount.x), jnp.asarray(mount.y), jnp.asarray(mount.theta)]).astype(here.dtype)
-    measurement = jnp.stack([scan.ranges, scan.bearings], -1)
+
+    n = scan.ranges.shape[0]
+    order = all_true(scan.valid, n)
+    valid = order < n
+    measurement = jnp.where(valid[:, None], jnp.stack([scan.ranges, scan.bearings], -1)[order], 0)
+    bearing = measurement[:, 1]
 
     def by_pose(x: Array, s: Array) -> Array:
         return jacobian(lambda p: point_from_measurement(p, s, at), lambda p: jac_point_pose(p, s, at), jacobians)(x)
@@ -96,8 +118,13 @@ def points_from_scan(scan: Scan, pose: Pose, mount: Mount, *, jacobians: Jacobia
 
     return Points(
         position=jax.vmap(lambda s: point_from_measurement(here, s, at))(measurement),
-        beam=unit(here[2] + at[2] + scan.bearings),
+        beam=unit(here[2] + at[2] + bearing),
+        range=measurement[:, 0],
+        turn=jnp.abs(bearing - jnp.concatenate([bearing[:1], bearing[:-1]])),
+        valid=valid,
+        index=order,
+        jac_pose=jax.vmap(lambda s: by_pose(here, s))(measurement),
+        jac_measurement=jax.vmap(by_measurement)(measurement),
         laser=rotate(here[2], at[:2]),
-        jac_point_pose=jax.vmap(lambda s: by_pose(here, s))(measurement),
-        jac_point_measurement=jax.vmap(by_measurement)(measurement),
+        spacing=scan.spacing,
     )

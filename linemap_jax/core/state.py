@@ -264,31 +264,6 @@ def empty_circles(capacity: int, dtype: Any = None) -> Circles:
     )
 
 
-def neutral_where_free(slots: SlotsT) -> SlotsT:
-    """The same lines or circles with neutral values in every free slot, so that nothing non-finite lurks there."""
-    k = slots.valid.shape[0]
-    empty = empty_lines if isinstance(slots, Lines) else empty_circles
-
-    def choose(value: Array, neutral: Array) -> Array:
-        return jnp.where(slots.valid.reshape((k,) + (1,) * (value.ndim - 1)), value, neutral)
-
-    return jax.tree.map(choose, slots, empty(k, slots.cov.dtype))
-
-
-def resize(slots: SlotsT, capacity: int) -> SlotsT:
-    """The same lines or circles with room for `capacity` of them; added slots are free.
-
-    Raises:
-      ValueError: if `capacity` is smaller than the present one: primitives would be lost.
-    """
-    have = slots.valid.shape[0]
-    if capacity < have:
-        raise ValueError(f"cannot shrink {have} slots to {capacity}")
-    empty = empty_lines if isinstance(slots, Lines) else empty_circles
-    dtype = slots.cov.dtype
-    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), slots, empty(capacity - have, dtype))
-
-
 def pad_stack(stacked: Any, size: int) -> Any:
     """Stacked items filled up to `size` by repeating the last one; whoever uses them knows how many count."""
     return jax.tree.map(

@@ -20,7 +20,8 @@ from linemap_jax.core.matching import normal_variance
 from linemap_jax.core.propagation import quadratic
 from linemap_jax.core.sensor import Points
 from linemap_jax.core.settings import SensorNoise, Thresholds
-from linemap_jax.core.state import Circles, Lines, Pose, Scan, pytree
+from linemap_jax.core.slots import all_true, first_true, put, rank_of_true, take
+from linemap_jax.core.state import Circles, Lines, Pose, pytree
 
 NEAR_PARALLEL = 1e-6
 """Cosine below which a beam and a line do not meet."""
@@ -30,20 +31,13 @@ NEAREST_BASE = 1e-3
 
 @pytree
 class Swath:
-    """The beams of a scan that returned, first things first: what they prove to be free.
+    """What the returns of a scan prove to be free."""
 
-    Positions are relative to the robot, in the axes of the world.
-    """
-
-    beam: Float[Array, "N 2"]  # unit vector
-    range: Float[Array, " N"]  # m
-    reach: Float[Array, " N"]  # m, with the extension behind the line that the beam met
+    points: Points
+    reach: Float[Array, " N"]  # m, with the extension behind the line that the beam met; 0 if it met none
     own: Int[Array, " N"]  # slot of the map's line that the beam measures, -1 for none
-    valid: Bool[Array, " N"]
     joined: Bool[Array, " N"]  # neighbour of the next one
-    laser: Float[Array, "2"]
     robot: Float[Array, "2"]  # m, in the world
-    spacing: Float[Array, ""]
 
 
 @pytree
@@ -74,9 +68,8 @@ Stretches = tuple[Float[Array, " M"], Float[Array, " M"], Bool[Array, " M"]]
 
 def swath_of_scan(
     points: Points,
-    scan: Scan,
     pose: Pose,
-    line_of_beam: Int[Array, " N"],
+    line_of_point: Int[Array, " N"],
     found: Lines,
     own: Int[Array, " L"],
     thresholds: Thresholds,
@@ -85,36 +78,23 @@ def swath_of_scan(
 
     Args:
       points: the points of the scan.
-      scan: the scan.
       pose: of the robot.
-      line_of_beam: the new line of each beam, -1 for none.
+      line_of_point: the new line of each point, -1 for none.
       found: the new lines.
       own: for each new line the line of the map that it is, or may be; -1 for none.
       thresholds: `wipe_extension`, `gap_beams`.
     """
-    n = scan.ranges.shape[0]
-    order = jnp.nonzero(scan.valid, size=n, fill_value=n - 1)[0]
-    count = jnp.sum(scan.valid)
-    valid = jnp.arange(n) < count
-    bearing = scan.bearings[order]
-    turn = jnp.abs(jnp.concatenate([bearing[1:], bearing[-1:]]) - bearing)
-    followed = jnp.concatenate([valid[1:], jnp.zeros(1, bool)])
-
-    line = jnp.maximum(line_of_beam, 0)
     to_line = found.anchor - (pose.mean[:2] + points.laser)[None]
     across = jnp.abs(found.offset + dot(found.normal, to_line))  # the scanner from each line
     pushed = jnp.where(across > NEAREST_BASE, 1 + thresholds.wipe_extension / jnp.maximum(across, NEAREST_BASE), 0)
-    reach = jnp.where(line_of_beam >= 0, scan.ranges * pushed[line], 0)
+    followed = (points.turn < thresholds.gap_beams * points.spacing) & points.valid
+    in_line = line_of_point >= 0
     return Swath(
-        beam=points.beam[order],
-        range=scan.ranges[order],
-        reach=reach[order],
-        own=jnp.where(line_of_beam >= 0, own[line], -1)[order],
-        valid=valid,
-        joined=valid & followed & (turn < thresholds.gap_beams * scan.spacing),
-        laser=points.laser,
+        points=points,
+        reach=jnp.where(in_line, points.range * pushed[line_of_point], 0),
+        own=jnp.where(in_line, own[line_of_point], -1),
+        joined=jnp.concatenate([followed[1:], jnp.zeros(1, bool)]),
         robot=pose.mean[:2],
-        spacing=scan.spacing,
     )
 
 
@@ -136,26 +116,26 @@ def passed_through(
       noise: of the sensor.
     """
     normal, tangent = line.normal, line.tangent
-    start = swath.robot - line.anchor + swath.laser
-    incidence = dot(swath.beam, normal[None])
+    start = swath.robot - line.anchor + swath.points.laser
+    incidence = dot(swath.points.beam, normal[None])
     meets = jnp.abs(incidence) > NEAR_PARALLEL
     safe = jnp.where(meets, incidence, 1)
     distance = (line.offset - dot(normal, start)) / safe
-    hit = swath.laser[None] + distance[:, None] * swath.beam
-    along = dot(tangent, start) + distance * dot(swath.beam, tangent[None])
+    hit = swath.points.laser[None] + distance[:, None] * swath.points.beam
+    along = dot(tangent, start) + distance * dot(swath.points.beam, tangent[None])
 
     # n^T F C_pose F^T n with F = [I, perp(hit)]
     lever = dot(perp(hit), normal[None])
     by_pose = (
         quadratic(normal, cov_pose[:2, :2]) + 2 * lever * dot(normal, cov_pose[:2, 2]) + lever**2 * cov_pose[2, 2]
     )
-    by_bearing = (distance * noise.bearing_sigma * dot(swath.beam, tangent[None])) ** 2
+    by_bearing = (distance * noise.bearing_sigma * dot(swath.points.beam, tangent[None])) ** 2
     variance = noise.range_sigma**2 + (normal_variance(line.cov, along) + by_pose + by_bearing) / safe**2
     margin = jnp.maximum(thresholds.wipe_sigmas * jnp.sqrt(variance), thresholds.match_distance / jnp.abs(safe))
-    reach = jnp.maximum(swath.range - margin, swath.reach)
+    reach = jnp.maximum(swath.points.range - margin, swath.reach)
 
     on_line = (along > line.extent[0]) & (along < line.extent[1])
-    passes = line.valid & swath.valid & meets & (swath.own != slot) & (distance > 0) & on_line & (distance < reach)
+    passes = line.valid & swath.points.valid & meets & (swath.own != slot) & (distance > 0) & on_line & (distance < reach)
     gone = swath.joined[:-1] & passes[:-1] & passes[1:]
     return jnp.minimum(along[:-1], along[1:]), jnp.maximum(along[:-1], along[1:]), gone
 
@@ -172,8 +152,7 @@ def triangles_of_scan(
       targets: the slots of those lines, -1 for none.
       thresholds: `wipe_extension`.
     """
-    at = jnp.maximum(targets, 0)
-    base = jax.tree.map(lambda x: x[at], model)
+    base = take(model, targets)
     apex = (pose.mean[:2] + points.laser)[None]
     step = base.anchor - apex
     across = jnp.abs(base.offset + dot(base.normal, step))
@@ -237,22 +216,22 @@ def wipe_lines(
 
     def step(carry: tuple[Lines, Array, Array]) -> tuple[Lines, Array, Array]:
         lines, todo, counts = carry
-        slot = jnp.argmax(todo).astype(jnp.int32)
+        slot = first_true(todo)
         # Lines are cut as they stood before wiping: what a split has put into a free slot is done with.
-        line = jax.tree.map(lambda x: x[slot], lines)
-        begin, end, keep = remaining(line.extent, stretches(line, slot), thresholds.min_length)
-        rank = jnp.cumsum(keep) - 1
+        line = take(lines, slot)
+        gone = stretches(line, slot)
+        begin, end, keep = remaining(line.extent, gone, thresholds.min_length)
+        rank = rank_of_true(keep)
         pieces = jnp.sum(keep)
-        valid = lines.valid.at[slot].set(False)
-        free = jnp.nonzero(~valid & (slots != slot), size=begin.shape[0], fill_value=k)[0]
-        into = jnp.where(rank == 0, slot, free[jnp.maximum(rank - 1, 0)])
-        into = jnp.where(keep, into, k)
+        free = all_true(~lines.valid, begin.shape[0])
+        into = jnp.where(rank == 0, slot, free[rank - 1])
         fragments = jax.vmap(_fragment, (None, 0, 0))(line, begin, end)
-        lines = dataclasses.replace(lines, valid=valid)
-        lines = jax.tree.map(lambda a, b: a.at[into].set(b, mode="drop"), lines, fragments)
+        cut = jnp.any(gone[2])
+        lines = dataclasses.replace(lines, valid=lines.valid.at[slot].set(~cut))
+        lines = put(lines, jnp.where(keep & cut & (into < k), into, -1), fragments)
         lost = jnp.any(keep & (into == k))
-        counts = counts + jnp.stack([pieces == 1, pieces > 1, pieces == 0, lost]).astype(counts.dtype)
-        return lines, todo.at[slot].set(False), counts
+        outcome = jnp.stack([pieces == 1, pieces > 1, pieces == 0, lost]) & cut
+        return lines, todo.at[slot].set(False), counts + outcome.astype(counts.dtype)
 
     model, _, counts = jax.lax.while_loop(unfinished, step, (model, cut, jnp.zeros(4, jnp.int32)))
     return model, Wiped(trimmed=counts[0], split=counts[1], deleted=counts[2], overflow=counts[3] > 0)
@@ -300,7 +279,7 @@ def passed_circles(
 
     def gone(center: Array, radius: Array) -> Array:
         from_robot = center - swath.robot
-        to_center = from_robot - swath.laser
+        to_center = from_robot - swath.points.laser
         distance = jnp.sqrt(dot(to_center, to_center))
         ahead = to_center / jnp.where(distance > 0, distance, 1)
 
@@ -310,12 +289,12 @@ def passed_circles(
 
         lateral = jnp.sqrt(spread(perp(ahead)) + (distance * noise.bearing_sigma) ** 2)
         depth = jnp.sqrt(spread(ahead) + noise.range_sigma**2)
-        along = dot(swath.beam, to_center[None])
-        window = jnp.abs(_cross(swath.beam, to_center[None])) < radius + thresholds.wipe_sigmas * lateral
-        witness = swath.valid & window & (along > 0)
-        beyond = swath.range > along + radius + thresholds.wipe_sigmas * depth
+        along = dot(swath.points.beam, to_center[None])
+        window = jnp.abs(_cross(swath.points.beam, to_center[None])) < radius + thresholds.wipe_sigmas * lateral
+        witness = swath.points.valid & window & (along > 0)
+        beyond = swath.points.range > along + radius + thresholds.wipe_sigmas * depth
         enough = jnp.sum(witness) >= 2
-        return enough & jnp.all(beyond | ~witness) & (2 * radius >= swath.spacing * distance)
+        return enough & jnp.all(beyond | ~witness) & (2 * radius >= swath.points.spacing * distance)
 
     return circles.valid & jax.vmap(gone)(circles.center, circles.radius)
 

@@ -1,0 +1,57 @@
+"""Runs of consecutive points: which points belong to which, and sums over them."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from linemap_jax.core.slots import all_true
+from linemap_jax.core.state import pytree
+
+
+@pytree
+class Runs:
+    """Runs of consecutive points, one after the other in `K` slots."""
+
+    first: Int[Array, " K"]  # the first point, 0 for a free slot
+    last: Int[Array, " K"]  # the last point, 0 for a free slot
+    valid: Bool[Array, " K"]
+    of_point: Int[Array, " N"]  # slot of each point's run, -1 for none
+
+    def sum(self, per_point: Float[Array, "N *s"]) -> Float[Array, "K *s"]:
+        """Sum over the points of each run.
+
+        A product with the incidence matrix: a scatter takes several times as long.
+        """
+        k, n = self.valid.shape[0], self.of_point.shape[0]
+        member = (self.of_point[None] == jnp.arange(k)[:, None]).astype(per_point.dtype)
+        # The highest precision: on a GPU the default takes ten bits of the mantissa.
+        total = jnp.dot(member, per_point.reshape(n, -1), precision=jax.lax.Precision.HIGHEST)
+        return total.reshape(k, *per_point.shape[1:])
+
+    def spread(self, per_run: Float[Array, "K *s"]) -> Float[Array, "N *s"]:
+        """The value of each point's run; something finite for points of no run."""
+        return per_run[self.of_point]
+
+
+def select_runs(
+    count: Float[Array, " N"], chosen: Bool[Array, " N"], capacity: int
+) -> tuple[Runs, Bool[Array, ""]]:
+    """Give slots to some runs, in order.
+
+    Args:
+      count: at the last point of a run, of how many points it consists.
+      chosen: at the last point of a run, whether it gets a slot; false at all other points.
+      capacity: number of slots `K`.
+
+    Returns:
+      The runs, and whether one found no slot.
+    """
+    n = chosen.shape[0]
+    last = all_true(chosen, capacity)
+    valid = last < n
+    last = jnp.where(valid, last, 0)
+    first = jnp.where(valid, last - count[last].astype(jnp.int32) + 1, 0)
+    index, slot = jnp.arange(n)[:, None], jnp.arange(capacity, dtype=jnp.int32)[None]
+    inside = valid[None] & (first[None] <= index) & (index <= last[None])
+    of_point = jnp.max(jnp.where(inside, slot, -1), -1)
+    return Runs(first=first, last=last, valid=valid, of_point=of_point), jnp.sum(chosen) > capacity

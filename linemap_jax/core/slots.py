@@ -1,0 +1,128 @@
+"""Padded slots: finding, taking and putting what stands in them.
+
+jax's `cumsum`, `argmin` and `nonzero` are many kernels each, or slow ones, on a CPU (40 to 80 us for 361 numbers where
+5 to 20 do). The forms below are one kernel each.
+"""
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from linemap_jax.core.state import Lines, SlotsT, empty_circles, empty_lines
+
+
+def first_true(which: Bool[Array, " K"]) -> Int[Array, ""]:
+    """Index of the first true one; `K` if there is none."""
+    k = which.shape[0]
+    return jnp.min(jnp.where(which, jnp.arange(k, dtype=jnp.int32), k))
+
+
+def all_true(which: Bool[Array, " N"], size: int) -> Int[Array, " M"]:
+    """Indices of the first `size` true ones, in order; `N` where there are no more."""
+    n = which.shape[0]
+    found = jnp.sort(jnp.where(which, jnp.arange(n, dtype=jnp.int32), n))
+    return found[:size] if size <= n else jnp.concatenate([found, jnp.full(size - n, n, jnp.int32)])
+
+
+def rank_of_true(which: Bool[Array, " N"]) -> Int[Array, " N"]:
+    """How many are true before each."""
+
+    def step(count: Array, one: Array) -> tuple[Array, Array]:
+        return count + one, count
+
+    return jax.lax.scan(step, jnp.zeros((), jnp.int32), which.astype(jnp.int32))[1]
+
+
+def least(score: Float[Array, "L K"]) -> tuple[Int[Array, " L"], Float[Array, " L"]]:
+    """Where in each row the least number stands, the first of equal ones, and that number."""
+    value = jnp.min(score, -1)
+    index = jnp.arange(score.shape[1], dtype=jnp.int32)[None]
+    return jnp.min(jnp.where(score == value[:, None], index, score.shape[1] - 1), -1), value
+
+
+def free_slots(wanted: Bool[Array, " M"], taken: Bool[Array, " K"]) -> tuple[Int[Array, " M"], Bool[Array, ""]]:
+    """A free slot for each that wants one, the lowest first, -1 where there is none; and whether that happened."""
+    k = taken.shape[0]
+    slot = all_true(~taken, wanted.shape[0])[rank_of_true(wanted)]
+    fits = wanted & (slot < k)
+    return jnp.where(fits, slot, -1).astype(jnp.int32), jnp.any(wanted & ~fits)
+
+
+def neutral_where_free(slots: SlotsT) -> SlotsT:
+    """The same lines or circles with neutral values in every free slot, so that nothing non-finite lurks there."""
+    empty = empty_lines if isinstance(slots, Lines) else empty_circles
+    return choose(slots.valid, slots, empty(slots.valid.shape[0], slots.cov.dtype))
+
+
+def choose(first: Bool[Array, " K"], a: SlotsT, b: SlotsT) -> SlotsT:
+    """The lines or circles of `a` where `first` holds, of `b` elsewhere."""
+    return jax.tree.map(lambda x, y: jnp.where(first.reshape(first.shape + (1,) * (x.ndim - 1)), x, y), a, b)
+
+
+def take(slots: SlotsT, index: Int[Array, "*s"]) -> SlotsT:
+    """The lines or circles in some slots; an index of -1 gives something finite that means nothing.
+
+    All floats go through one gather, not one for each field: what XLA compiles and starts are kernels.
+    """
+    floats, back = _packed(slots)
+    rows = back(floats[index])
+    return dataclasses.replace(
+        rows,
+        **{name: getattr(slots, name)[index] for name in _DISCRETE if hasattr(slots, name)},
+    )
+
+
+def put(slots: SlotsT, index: Int[Array, " M"], rows: SlotsT) -> SlotsT:
+    """Lines or circles written into some slots; an index of -1 writes nothing. No index but -1 may occur twice."""
+    into = jnp.where(index < 0, slots.valid.shape[0], index)
+    floats, back = _packed(slots)
+    floats = floats.at[into].set(_packed(rows)[0], mode="drop")
+    discrete = {
+        name: getattr(slots, name).at[into].set(getattr(rows, name), mode="drop")
+        for name in _DISCRETE
+        if hasattr(slots, name)
+    }
+    return dataclasses.replace(back(floats), **discrete)
+
+
+_DISCRETE = ("times_detected", "fitted", "valid")
+
+
+def _packed(slots: SlotsT) -> tuple[Float[Array, "K P"], Callable[[Array], SlotsT]]:
+    """All floats of each slot in one row, and the way back; the other fields are left as they are."""
+    k = slots.valid.shape[0]
+    names = [field.name for field in dataclasses.fields(slots) if field.name not in _DISCRETE]
+    shapes = [getattr(slots, name).shape[1:] for name in names]
+    sizes = [math.prod(shape) for shape in shapes]
+    packed = jnp.concatenate([getattr(slots, name).reshape(k, -1) for name in names], -1)
+
+    def back(rows: Array) -> SlotsT:
+        parts = jnp.split(rows, list(itertools.accumulate(sizes))[:-1], -1)
+        return dataclasses.replace(
+            slots,
+            **{
+                name: part.reshape(*rows.shape[:-1], *shape)
+                for name, part, shape in zip(names, parts, shapes, strict=True)
+            },
+        )
+
+    return packed, back
+
+
+def resize(slots: SlotsT, capacity: int) -> SlotsT:
+    """The same lines or circles with room for `capacity` of them; added slots are free.
+
+    Raises:
+      ValueError: if `capacity` is smaller than the present one: primitives would be lost.
+    """
+    have = slots.valid.shape[0]
+    if capacity < have:
+        raise ValueError(f"cannot shrink {have} slots to {capacity}")
+    empty = empty_lines if isinstance(slots, Lines) else empty_circles
+    dtype = slots.cov.dtype
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), slots, empty(capacity - have, dtype))
