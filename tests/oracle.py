@@ -588,7 +588,7 @@ def _circle_of_cluster(
         not margin.below(fit.radius, 5 * sweep.sr)
         and margin.below(fit.radius, float(thresholds.cluster_distance))
         and margin.below(0.0, sight @ fit.center)
-        and not margin.below(n + 3 * math.sqrt(2 * n), fit.chi2)
+        and not margin.below(n - 3 + 3 * math.sqrt(2 * (n - 3)), fit.chi2)
         and margin.below(math.sqrt(fit.cov[2, 2]), fit.radius / 3)
     )
     if not good:
@@ -663,10 +663,10 @@ def extract(
         if line is None:
             rejected["too_short"] += len(run)
             continue
-        in_line[run] = True
         if len(found) == capacity.lines:
             status |= Status.SCAN_LINES_FULL
             continue
+        in_line[run] = True
         line_of_beam[sweep.beam[run]] = len(found)
         found.append(line)
     lines = Lines(
@@ -687,7 +687,8 @@ def extract(
             continue
         circle = _circle_of_cluster(sweep, cluster, thresholds=thresholds, rules=rules, margin=margin)
         nearest = distance_to_segments(circle["center"], lines).min(initial=math.inf)
-        if margin.below(nearest, float(thresholds.circle_line_distance)):
+        rim = circle["radius"] if circle["fitted"] else 0.0
+        if margin.below(nearest, float(thresholds.circle_line_distance) + rim):
             rejected["near_line"] += len(cluster)
             continue
         if len(kept) == capacity.circles:
@@ -837,14 +838,19 @@ def _var_across(cov: np.ndarray, s: np.ndarray) -> np.ndarray:
     return cov[:, None, 0, 0] - 2 * s * cov[:, None, 0, 1] + s**2 * cov[:, None, 1, 1]
 
 
-def closest(nis: np.ndarray, good: np.ndarray, ties: Margin) -> int | None:
-    """Which of the good candidates has the least NIS, the first of equals; None if none is good."""
+def closest(g: Gates, good: np.ndarray, ties: Margin) -> int | None:
+    """Which of the good candidates is the best match, the first of equals; None if none is good.
+
+    The one with the least NIS; a metre more of overlap counts as a thousandth, which decides between fragments of a
+    line that was cut, whose NIS is the same.
+    """
     candidates = np.flatnonzero(good)
     if not len(candidates):
         return None
-    order = candidates[np.argsort(nis[candidates], kind="stable")]
+    score = g.nis + 1e-3 * g.gap
+    order = candidates[np.argsort(score[candidates], kind="stable")]
     if len(order) > 1:
-        ties.below(float(nis[order[0]]), float(nis[order[1]]))
+        ties.below(float(score[order[0]]), float(score[order[1]]))
     return int(order[0])
 
 
@@ -863,8 +869,7 @@ def match_line(new: Lines, lines: Lines, *, thresholds: Any, ties: Margin) -> Ma
     if not len(slots):
         return Match(-1, -1, 0.0, 0)
     g = gates(new, lines.take(slots), thresholds=thresholds)
-    # The statistical gate is one threshold on the same number: the least NIS is the match or nothing is.
-    best = closest(g.nis, g.geometric, ties)
+    best = closest(g, g.geometric, ties)
     if best is None:
         return Match(-1, -1, 0.0, 0)
     slot = int(slots[best])
@@ -883,7 +888,7 @@ def group_new(
         roots = list(groups)
         if roots:
             g = gates(lines.take(i), lines.take(roots), thresholds=thresholds)
-            best = closest(g.nis, g.geometric & g.statistical, ties)
+            best = closest(g, g.geometric & g.statistical, ties)
             if best is not None:
                 groups[roots[best]].append(i)
                 continue
@@ -1017,11 +1022,11 @@ def _merge(lines: Lines, targets: np.ndarray, *, thresholds: Any, ties: Margin) 
         others = others[others != g]
         if g < 0 or g in targets[:i] or not len(others):
             continue
-        low, high = np.minimum(g, others), np.maximum(g, others)
-        pairs = gates(lines.take(high), lines.take(low), thresholds=thresholds)
-        best = closest(pairs.nis, pairs.geometric & pairs.statistical & (pairs.gap < 0), ties)
-        if best is not None:
-            candidates.append((float(pairs.nis[best]), i, int(low[best]), int(high[best])))
+        pairs = gates(lines.take(int(g)), lines.take(others), thresholds=thresholds)
+        best = closest(pairs, pairs.geometric & (pairs.gap < 0), ties)
+        if best is not None and pairs.statistical[best]:
+            other = int(others[best])
+            candidates.append((float(pairs.nis[best]), i, min(int(g), other), max(int(g), other)))
 
     freed: dict[int, int] = {}
     for candidate in candidates:
@@ -1048,7 +1053,9 @@ Cuts = dict[int, list[tuple[float, float]]]
 """For slots of lines: the intervals along the tangent that are to go."""
 
 
-def beam_cuts(lines: Lines, sweep: Sweep, found: Extraction, own: np.ndarray, *, thresholds: Any) -> Cuts:
+def beam_cuts(
+    lines: Lines, sweep: Sweep, found: Extraction, own: np.ndarray, targets: np.ndarray, *, thresholds: Any
+) -> Cuts:
     """What the beams of a scan have passed through, in place of the wipe triangle of s6.2.
 
     Args:
@@ -1056,6 +1063,7 @@ def beam_cuts(lines: Lines, sweep: Sweep, found: Extraction, own: np.ndarray, *,
       sweep: the valid beams.
       found: what was extracted from them.
       own: for each new line the slot of the line that it was taken for, -1 for none. Shape `[n]`.
+      targets: for each new line the slot of the line that it is part of, -1 for none. Shape `[n]`.
       thresholds: the margins.
 
     Returns:
@@ -1087,10 +1095,12 @@ def beam_cuts(lines: Lines, sweep: Sweep, found: Extraction, own: np.ndarray, *,
     var_line = cov[:, 0, 0] - 2 * along * cov[:, 0, 1] + along**2 * cov[:, 1, 1]
     var = var_line + dot(row @ sweep.cov_pose, row) + r_line**2 * sweep.sa**2 * dot(tangent, u) ** 2
     margin = np.maximum(t.wipe_sigmas * np.sqrt(sweep.sr**2 + var / den**2), t.match_distance / np.abs(den))
-    # A beam that ended on an extracted line reaches a little behind that line.
+    # A beam that ended on an extracted line reaches a little behind that line, to what was seen no more often.
+    times = np.where(targets >= 0, lines.times_detected[targets], 0)
+    dares = np.append(times, 0)[label[i]] >= old.times_detected[j]
     height = np.abs(dot(found.lines.normal, apex - found.lines.anchor) - found.lines.offset)
     stretch = np.where(height < EDGE_ON, 0.0, 1 + t.wipe_extension / np.maximum(height, EDGE_ON))
-    reach = np.maximum(sweep.r[i] - margin, sweep.r[i] * np.append(stretch, 0.0)[label[i]])
+    reach = np.maximum(sweep.r[i] - margin, np.where(dares, sweep.r[i] * np.append(stretch, 0.0)[label[i]], 0.0))
     passed = np.zeros(meets.shape, bool)
     passed[j, i] = r_line < reach
 
@@ -1196,22 +1206,17 @@ def match_circle(circles: Circles, found: Circles, i: int, *, thresholds: Any, r
     `suspect` is the nearest circle where the distance would do, but the covariances forbid it.
     """
     t = _numbers(thresholds)
-    distance = np.hypot(*(found.center[i] - circles.center).T)
-    near = np.flatnonzero(circles.valid & (distance < t.circle_match_distance))
-    near = near[np.argsort(distance[near], kind="stable")]
-    if not len(near):
+    distance = np.where(circles.valid, np.hypot(*(found.center[i] - circles.center).T), math.inf)
+    j = int(np.argmin(distance))
+    if not distance[j] < t.circle_match_distance:
         return Match(-1, -1, 0.0, 0), math.inf
-    nis = {}
-    for j in near:
-        if found.fitted[i] and circles.fitted[j]:
-            d = _circle_state(found, i) - _circle_state(circles, j)
-            nis[j] = float(d @ np.linalg.solve(found.cov[i] + circles.cov[j], d))
-    first = int(near[0])
-    shown = (nis[first], 3) if first in nis else (0.0, 0)
-    for j in near:
-        if not (rules.weigh_circles and j in nis) or nis[j] < t.circle_match_nis:
-            return Match(int(j), -1, *shown), float(distance[j])
-    return Match(-1, first, *shown), math.inf
+    if not (found.fitted[i] and circles.fitted[j]):
+        return Match(j, -1, 0.0, 0), float(distance[j])
+    d = _circle_state(found, i) - _circle_state(circles, j)
+    nis = float(d @ np.linalg.solve(found.cov[i] + circles.cov[j], d))
+    if rules.weigh_circles and not nis < t.circle_match_nis:
+        return Match(-1, j, nis, 3), math.inf
+    return Match(j, -1, nis, 3), float(distance[j])
 
 
 def _wiped_by_beams(circles: Circles, slot: int, sweep: Sweep, *, thresholds: Any) -> bool:
@@ -1301,7 +1306,7 @@ def _update_circles(
 
     on_map = lines.take(np.flatnonzero(lines.valid))
     for i in added:
-        if (distance_to_segments(new.center[i], on_map) < reach).any():
+        if (distance_to_segments(new.center[i], on_map) < reach + new.radius[i] * new.fitted[i]).any():
             continue
         slot = _lowest_free(circles)
         if slot is None:
@@ -1314,7 +1319,8 @@ def _update_circles(
 
     seen = lines.take([slot for slot in set(targets.tolist()) if slot >= 0 and lines.valid[slot]])
     for slot in np.flatnonzero(circles.valid).tolist():
-        if (distance_to_segments(circles.center[slot], seen) < reach).any():
+        rim = circles.radius[slot] * circles.fitted[slot]
+        if (distance_to_segments(circles.center[slot], seen) < reach + rim).any():
             _free(circles, slot)
             report.deleted += 1
 
@@ -1396,7 +1402,7 @@ def update(
 
     if rules.wipe_by_beams:
         own = np.where(targets >= 0, targets, suspects)
-        _cut(lines, beam_cuts(lines, sweep, found, own, thresholds=thresholds), report, thresholds=thresholds)
+        _cut(lines, beam_cuts(lines, sweep, found, own, targets, thresholds=thresholds), report, thresholds=thresholds)
     elif mode == "simultaneous":
         cuts: Cuts = {}
         for slot in sorted({slot for slot in targets.tolist() if slot >= 0}):

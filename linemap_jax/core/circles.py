@@ -190,6 +190,7 @@ def _fit_circles(
     cov = propagate(inverse(sums[:, :9].reshape(-1, 3, 3)), sums[:, 9:18].reshape(-1, 3, 3))
 
     center, radius = circle[:, :2], circle[:, 2]
+    dof = jnp.maximum(n - 3, 1)
     believed = (
         solvable
         & jnp.all(jnp.isfinite(circle), -1)
@@ -197,14 +198,17 @@ def _fit_circles(
         & (radius >= 5 * noise.range_sigma)  # smaller ones are lost in the noise
         & (radius < thresholds.cluster_distance)
         & (dot(middle - points.laser[None], center) > 0)  # we see the near side of a pole, never its inside
-        & (misfit <= n + 3 * jnp.sqrt(2 * n))  # 3 sigma of chi-square
+        & (misfit <= dof + 3 * jnp.sqrt(2 * dof))  # 3 sigma of chi-square
         & (cov[:, 2, 2] < (radius / 3) ** 2)
     )
     return center, radius, jnp.where(believed[:, None, None], cov, 0), believed
 
 
 def near_lines(circles: Circles, lines: Lines, thresholds: Thresholds) -> Bool[Array, " C"]:
-    """Section 4.3.1: which circles lie too close to a line to be modelled; they are probably its noise."""
+    """Section 4.3.1: which circles lie too close to a line to be modelled; they are probably its noise.
+
+    A fitted circle is a body, and is held against the line with its rim: the bent end of a wall has a centre behind it.
+    """
 
     def distance2(center: Float[Array, "2"], line: Lines) -> Float[Array, ""]:
         step = center - line.anchor
@@ -214,4 +218,5 @@ def near_lines(circles: Circles, lines: Lines, thresholds: Thresholds) -> Bool[A
         return across**2 + beyond**2
 
     every = jax.vmap(jax.vmap(distance2, (None, 0)), (0, None))(circles.center, lines)
-    return circles.valid & jnp.any(lines.valid[None] & (every < thresholds.circle_line_distance**2), -1)
+    reach = thresholds.circle_line_distance + jnp.where(circles.fitted, circles.radius, 0)
+    return circles.valid & jnp.any(lines.valid[None] & (every < reach[:, None] ** 2), -1)

@@ -174,15 +174,16 @@ def _update_lines(
 
     slot = jnp.where(leader >= 0, NEW, match.slot)
     slot = jnp.where(targets < 0, LEFT_OUT, slot)
+    suspect = match.suspect
     merged = jnp.zeros((), jnp.int32)
     if rules.merge:
         model, moved, merged = _merge(model, fused, jnp.where(first, targets, -1), thresholds, rules)
         targets = jnp.where(targets >= 0, moved[targets], targets)
-        slot = jnp.where(slot >= 0, moved[slot], slot)
+        slot, suspect = (jnp.where(x >= 0, moved[x], x) for x in (slot, suspect))
     return _LineUpdate(
         model=model,
         targets=targets,
-        own=jnp.where(targets >= 0, targets, match.suspect),
+        own=jnp.where(targets >= 0, targets, suspect),
         slot=slot,
         nis=match.nis,
         dof=jnp.where(match.compared, 2, 0).astype(jnp.int32),
@@ -261,7 +262,8 @@ def _sweep(
     """Section 6: by beams or by triangles."""
     if rules.wipe_by_beams:
         line_of_point = jnp.where(points.valid, found.line_of_beam[points.index], -1)
-        swath = wiping.swath_of_scan(points, pose, line_of_point, found.lines, lines.own, thresholds)
+        times = jnp.where(lines.targets >= 0, lines.model.times_detected[lines.targets], 0)
+        swath = wiping.swath_of_scan(points, pose, line_of_point, found.lines, lines.own, times, thresholds)
         model, wiped = wiping.wipe_lines(
             lines.model,
             lambda line, slot: wiping.passed_through(line, slot, swath, pose.cov, thresholds, noise),

@@ -16,6 +16,9 @@ from linemap_jax.core.settings import Rules, Thresholds
 from linemap_jax.core.slots import least, take
 from linemap_jax.core.state import Circles, Lines, pytree
 
+OVERLAP_WEIGHT = 1e-3
+"""1/m: a metre more of overlap counts like this much less of the normalised distance. It decides between equals only."""
+
 
 @pytree
 class LineComparison:
@@ -87,9 +90,10 @@ def best_line(
     among: Bool[Array, "L K"] | None = None,
     overlapping: bool = False,
 ) -> tuple[Int[Array, " L"], Float[Array, " L"]]:
-    """For each new line the geometric match with the least normalised distance.
+    """For each new line its best geometric match.
 
-    Among several the paper does not say which to take.
+    The paper does not say which of several to take. Here it is the one with the least normalised distance; among equal
+    ones, such as the fragments of a wall that was cut in two, the one that overlaps most.
 
     Args:
       new: `L` new lines.
@@ -106,11 +110,13 @@ def best_line(
     def score(a: Lines, b: Lines) -> Float[Array, ""]:
         pair = compare_lines(a, b, thresholds)
         counts = pair.geometric & (pair.gap < 0) if overlapping else pair.geometric
-        return jnp.where(counts, pair.nis, jnp.inf)
+        return jnp.where(counts, pair.nis + OVERLAP_WEIGHT * pair.gap, jnp.inf)
 
     by_model = jax.vmap(score, (None, 0))
-    nis = jax.vmap(by_model, (0, None))(new, model)
-    return least(nis if among is None else jnp.where(among, nis, jnp.inf))
+    scores = jax.vmap(by_model, (0, None))(new, model)
+    slot, best = least(scores if among is None else jnp.where(among, scores, jnp.inf))
+    nis = jax.vmap(lambda a, b: compare_lines(a, b, thresholds).nis)(new, take(model, slot))
+    return slot, jnp.where(jnp.isfinite(best), nis, jnp.inf)
 
 
 def normal_variance(cov: Float[Array, "2 2"], along: Float[Array, "*s"]) -> Float[Array, "*s"]:
@@ -175,12 +181,13 @@ def group_lines(
     with_cov = dataclasses.replace(new, cov=cov)
     by_model = jax.vmap(compare_lines, (None, 0, None))
     pair = jax.vmap(by_model, (0, None, None))(with_cov, with_cov, thresholds)
-    nis = jnp.where(pair.geometric & (pair.nis < thresholds.match_nis), pair.nis, jnp.inf)
+    agree = pair.geometric & (pair.nis < thresholds.match_nis)
+    score = jnp.where(agree, pair.nis + OVERLAP_WEIGHT * pair.gap, jnp.inf)
     index = jnp.arange(unmatched.shape[0])
 
     def step(i: Array, leader: Array) -> Array:
-        distance = jnp.where(leader == index, nis[i], jnp.inf)  # only lines before i lead yet
-        best, value = least(distance[None])
+        candidates = jnp.where(leader == index, score[i], jnp.inf)  # only lines before i lead yet
+        best, value = least(candidates[None])
         mine = jnp.where(jnp.isfinite(value[0]), best[0], i)
         return leader.at[i].set(jnp.where(unmatched[i], mine, -1))
 

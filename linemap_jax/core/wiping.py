@@ -36,6 +36,7 @@ class Swath:
     points: Points
     reach: Float[Array, " N"]  # m, with the extension behind the line that the beam met; 0 if it met none
     own: Int[Array, " N"]  # slot of the map's line that the beam measures, -1 for none
+    times: Int[Array, " N"]  # how often that line was detected, 0 for none
     joined: Bool[Array, " N"]  # neighbour of the next one
     robot: Float[Array, "2"]  # m, in the world
 
@@ -72,6 +73,7 @@ def swath_of_scan(
     line_of_point: Int[Array, " N"],
     found: Lines,
     own: Int[Array, " L"],
+    times: Int[Array, " L"],
     thresholds: Thresholds,
 ) -> Swath:
     """What the beams of a scan passed through.
@@ -82,6 +84,7 @@ def swath_of_scan(
       line_of_point: the new line of each point, -1 for none.
       found: the new lines.
       own: for each new line the line of the map that it is, or may be; -1 for none.
+      times: how often that line was detected; 0 if the new line is no part of it.
       thresholds: `wipe_extension`, `gap_beams`.
     """
     to_line = found.anchor - (pose.mean[:2] + points.laser)[None]
@@ -93,6 +96,7 @@ def swath_of_scan(
         points=points,
         reach=jnp.where(in_line, points.range * pushed[line_of_point], 0),
         own=jnp.where(in_line, own[line_of_point], -1),
+        times=jnp.where(in_line, times[line_of_point], 0),
         joined=jnp.concatenate([followed[1:], jnp.zeros(1, bool)]),
         robot=pose.mean[:2],
     )
@@ -105,7 +109,8 @@ def passed_through(
 
     A beam passed through if it ended beyond the line by `wipe_sigmas` of the predicted spread of that distance, which
     holds the range, the line, the pose and the bearing; and in any case by `match_distance`. A beam that met another
-    line reaches `wipe_extension` behind that. A beam never wipes the line that it is a measurement of.
+    line reaches `wipe_extension` behind that, to wipe noise; but not what was detected more often than the line that it
+    met. A beam never wipes the line that it is a measurement of.
 
     Args:
       line: one line, no batch axis.
@@ -115,27 +120,31 @@ def passed_through(
       thresholds: `wipe_...`, `match_distance`.
       noise: of the sensor.
     """
+    points = swath.points
     normal, tangent = line.normal, line.tangent
-    start = swath.robot - line.anchor + swath.points.laser
-    incidence = dot(swath.points.beam, normal[None])
+    start = swath.robot - line.anchor + points.laser
+    incidence = dot(points.beam, normal[None])
+    sideways = dot(points.beam, tangent[None])
     meets = jnp.abs(incidence) > NEAR_PARALLEL
-    safe = jnp.where(meets, incidence, 1)
-    distance = (line.offset - dot(normal, start)) / safe
-    hit = swath.points.laser[None] + distance[:, None] * swath.points.beam
-    along = dot(tangent, start) + distance * dot(swath.points.beam, tangent[None])
+    distance = (line.offset - dot(normal, start)) / jnp.where(meets, incidence, 1)
+    along = dot(tangent, start) + distance * sideways
 
     # n^T F C_pose F^T n with F = [I, perp(hit)]
-    lever = dot(perp(hit), normal[None])
+    lever = dot(perp(points.laser[None] + distance[:, None] * points.beam), normal[None])
     by_pose = (
         quadratic(normal, cov_pose[:2, :2]) + 2 * lever * dot(normal, cov_pose[:2, 2]) + lever**2 * cov_pose[2, 2]
     )
-    by_bearing = (distance * noise.bearing_sigma * dot(swath.points.beam, tangent[None])) ** 2
-    variance = noise.range_sigma**2 + (normal_variance(line.cov, along) + by_pose + by_bearing) / safe**2
-    margin = jnp.maximum(thresholds.wipe_sigmas * jnp.sqrt(variance), thresholds.match_distance / jnp.abs(safe))
-    reach = jnp.maximum(swath.points.range - margin, swath.reach)
+    by_bearing = (distance * noise.bearing_sigma * sideways) ** 2
+    # How far beyond the line the beam ended, along the line's normal, against the spread of that.
+    beyond = (points.range - distance) * jnp.abs(incidence)
+    spread = (noise.range_sigma * incidence) ** 2 + normal_variance(line.cov, along) + by_pose + by_bearing
+    margin = jnp.maximum(thresholds.wipe_sigmas**2 * spread, thresholds.match_distance**2)
+    passed = (beyond > 0) & (beyond**2 > margin)
+    behind = (distance < swath.reach) & (swath.times >= line.times_detected)
 
     on_line = (along > line.extent[0]) & (along < line.extent[1])
-    passes = line.valid & swath.points.valid & meets & (swath.own != slot) & (distance > 0) & on_line & (distance < reach)
+    meets = meets & (distance > 0) & on_line & points.valid & line.valid
+    passes = meets & (swath.own != slot) & (passed | behind)
     gone = swath.joined[:-1] & passes[:-1] & passes[1:]
     return jnp.minimum(along[:-1], along[1:]), jnp.maximum(along[:-1], along[1:]), gone
 
