@@ -146,14 +146,18 @@ def _of_demo(demo: Demo) -> Build:
 
 def _build(command: Build) -> int:
     options = _options(command)
+    from linemap_jax.core.settings import Mount
     from linemap_jax.io.map_file import write_map
     from linemap_jax.io.plot import plot_map
 
     map_file, picture = command.output / "map.json", command.output / "map.png"
-    _prepare_folder(command.output, map_file, picture, overwrite=command.overwrite)
+    _check_output(command.output, map_file, picture, overwrite=command.overwrite)
     log = _open(command)
+    if command.laser_offset is not None and next(iter(log)).pose_frame == "laser":
+        options["mount"] = Mount()
+        _say(command, f"warning: {log.path}: its poses are the laser's, so that --laser-offset has no effect")
     with _progress(command, log):
-        line_map, report, positions, seconds = _map_of_log(command, log, options)
+        line_map, report, positions, seconds, interrupted = _map_of_log(command, log, options)
     _warn(command, log)
 
     settings = {
@@ -162,8 +166,12 @@ def _build(command: Build) -> int:
         "pose_sigma": command.pose_sigma,
         **{name: options[name] for name in ("thresholds", "noise", "mount", "rules", "covariance", "jacobians")},
     }
+    _make_folder(command.output)
     write_map(map_file, line_map, settings, overwrite=command.overwrite)
     plot_map(picture, line_map, positions, title=command.log.name, overwrite=command.overwrite)
+    if interrupted:
+        print(f"linemap: interrupted; the map so far is in {command.output}", file=sys.stderr)
+        return 130
     summary = _summary(command, line_map, report, options, seconds) | {"map": str(map_file), "picture": str(picture)}
     print(json.dumps(summary, indent=2) if command.json else _in_words(summary))
     return 0
@@ -171,8 +179,11 @@ def _build(command: Build) -> int:
 
 def _map_of_log(
     command: Build, log: "Log", options: dict[str, Any]
-) -> tuple["LineMap", "Report", list[tuple[float, float]], list[float]]:
-    """The map, the reports, the positions of the robot, and the seconds that each chunk took, reading included."""
+) -> tuple["LineMap", "Report", list[tuple[float, float]], list[float], bool]:
+    """The map, the reports, the positions of the robot, the seconds that each chunk took, reading included.
+
+    And whether somebody interrupted it: then the map is the one so far.
+    """
     from linemap_jax.build import CHUNK, build_chunks, join_reports
 
     positions, reports, seconds = [], [], []
@@ -182,19 +193,20 @@ def _map_of_log(
             positions.extend(map(tuple, chunk.poses.mean[:, :2].tolist()))
             yield chunk.scans, chunk.poses
 
-    line_map = None
+    line_map, interrupted = None, False
     started = time.perf_counter()
     try:
-        for line_map, report in build_chunks(driven(), chunk=CHUNK, **options):
+        for grown, report in build_chunks(driven(), chunk=CHUNK, **options):
+            line_map = grown
             reports.append(report)
             seconds.append(time.perf_counter() - started)
             started = time.perf_counter()
     except KeyboardInterrupt:
         if line_map is None:
             raise
-        print("linemap: interrupted; this is the map so far", file=sys.stderr)
+        interrupted = True
     assert line_map is not None  # a log without a scan has been refused by its reader
-    return line_map, join_reports(reports), positions, seconds
+    return line_map, join_reports(reports), positions, seconds, interrupted
 
 
 def _summary(
@@ -219,8 +231,8 @@ def _summary(
         "explained": share,
         "median_line_length_m": float(np.median(length)) if length.size else 0.0,
         "duplicates": int(duplicates(lines).sum()),
-        # The first chunk holds the compilation.
-        "us_per_scan": 1e6 * float(np.median(seconds[1:-1] or seconds)) / CHUNK,
+        # The first chunk holds the compilation: a log of one chunk does not tell.
+        "us_per_scan": 1e6 * float(np.median(seconds[1:])) / CHUNK if len(seconds) > 1 else None,
         "seconds_to_first_chunk": seconds[0],
         "counts": {name: int(getattr(report, name).sum()) for name in COUNTS},
     }
@@ -228,11 +240,13 @@ def _summary(
 
 def _in_words(summary: dict[str, Any]) -> str:
     counts = ", ".join(f"{number} {what}" for what, number in summary["counts"].items())
+    pace = summary["us_per_scan"]
+    then = "too few scans to time" if pace is None else f"then {pace:.0f} us a scan"
     return (
         f"{summary['scans']} scans -> {summary['lines']} lines, {summary['circles']} circles ({counts})\n"
         f"{summary['explained']:.1%} of the returns under 20 m lie within 10 cm of them; "
         f"median line {summary['median_line_length_m']:.2f} m, {summary['duplicates']} duplicate lines\n"
-        f"{summary['us_per_scan']:.0f} us a scan, after {summary['seconds_to_first_chunk']:.1f} s to compile\n"
+        f"{summary['seconds_to_first_chunk']:.1f} s to compile, {then}\n"
         f"map:     {summary['map']}\n"
         f"picture: {summary['picture']}"
     )
@@ -266,8 +280,9 @@ def _options(command: LogOptions) -> dict[str, Any]:
     import jax
 
     jax.config.update("jax_enable_x64", command.dtype == "float64")
-    jax.config.update("jax_compilation_cache_dir", str(_cache_folder()))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # else the user has said where
+        jax.config.update("jax_compilation_cache_dir", str(_cache_folder()))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
     from linemap_jax.core.settings import Mount, SensorNoise, preset
     from linemap_jax.io.config import read_config
 
@@ -320,21 +335,30 @@ def _chunks(command: LogOptions, log: "Log", size: int) -> Iterator["Chunk"]:
     )
 
 
-def _prepare_folder(folder: Path, *files: Path, overwrite: bool) -> None:
-    """Make the folder, and refuse before the work what would be refused after it."""
+def _check_output(folder: Path, *files: Path, overwrite: bool) -> None:
+    """Refuse before the work what would be refused after it. Nothing is made yet: the log may be refused too."""
     from linemap_jax.io.atomic import OutputError
 
-    if folder.exists() and not folder.is_dir():
-        raise OutputError(f"cannot write to {folder}: it is not a folder")
-    for file in files:
-        if file.exists() and not overwrite:
-            raise OutputError(f"{file} exists already; use --overwrite to replace it")
+    try:
+        for file in files:
+            if file.exists() and not overwrite:
+                raise OutputError(f"{file} exists already; use --overwrite to replace it")
+        lowest = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    except PermissionError as error:
+        raise OutputError(f"cannot write to the folder {folder}: {error.strerror}") from error
+    if not lowest.is_dir():
+        raise OutputError(f"cannot write to {folder}: {lowest} is not a folder")
+    if not os.access(lowest, os.W_OK | os.X_OK):
+        raise OutputError(f"cannot write to the folder {lowest}: permission denied")
+
+
+def _make_folder(folder: Path) -> None:
+    from linemap_jax.io.atomic import OutputError
+
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"cannot make the folder {folder}: {error.strerror}") from error
-    if not os.access(folder, os.W_OK):
-        raise OutputError(f"cannot write to the folder {folder}: permission denied")
 
 
 def _cache_folder() -> Path:

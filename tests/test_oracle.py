@@ -4,6 +4,7 @@ from functools import partial
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import oracle
 import pytest
@@ -35,9 +36,14 @@ def extract_all(scans: Any, poses: Any, name: str, jacobians: str = "autodiff") 
     return jax.lax.map(lambda x: one_scan(*x), (scans, poses))
 
 
+def seen_from(anchor: np.ndarray, lines: Any, keep: np.ndarray) -> Any:
+    """The valid lines, relative to other anchors."""
+    return reanchor(jax.tree.map(lambda x: jnp.asarray(x[keep]), lines), jnp.asarray(anchor))
+
+
 def line_differences(mine: Any, theirs: Any, keep: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Difference of (offset, angle) and relative difference of the covariance (Frobenius), at the oracle's anchors."""
-    moved = jax.tree.map(np.asarray, reanchor(jax.tree.map(lambda x: x[keep], mine), theirs.anchor))
+    moved = jax.tree.map(np.asarray, seen_from(theirs.anchor, mine, keep))
     turn = np.abs((moved.angle - theirs.angle + np.pi) % (2 * np.pi) - np.pi)
     estimate = np.maximum(np.abs(moved.offset - theirs.offset), turn)
     cov = np.linalg.norm(moved.cov - theirs.cov, axis=(1, 2)) / np.linalg.norm(theirs.cov, axis=(1, 2))
@@ -96,7 +102,7 @@ def test_float32_extraction_is_that_of_the_oracle(log: str) -> None:
             continue
         same += 1
         mine = jax.tree.map(lambda x: x.astype("float64") if x.dtype == np.float32 else x, mine)
-        moved = reanchor(jax.tree.map(lambda x: x[mine.lines.valid], mine.lines), theirs.lines.anchor)
+        moved = seen_from(theirs.lines.anchor, mine.lines, mine.lines.valid)
         sigma = np.sqrt(np.diagonal(theirs.lines.cov, axis1=1, axis2=2))
         np.testing.assert_array_less(np.abs(moved.offset - theirs.lines.offset), 0.01 * sigma[:, 0])
         np.testing.assert_array_less(np.abs(moved.angle - theirs.lines.angle), 0.01 * sigma[:, 1])

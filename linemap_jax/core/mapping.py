@@ -260,21 +260,27 @@ def _sweep(
     rules: Rules,
 ) -> _Sweep:
     """Section 6: by beams or by triangles."""
+    slots = jnp.arange(lines.model.valid.shape[0], dtype=jnp.int32)
     if rules.wipe_by_beams:
         line_of_point = jnp.where(points.valid, found.line_of_beam[points.index], -1)
         times = jnp.where(lines.targets >= 0, lines.model.times_detected[lines.targets], 0)
         swath = wiping.swath_of_scan(points, pose, line_of_point, found.lines, lines.own, times, thresholds)
+        affected = jax.vmap(lambda line, slot: wiping.may_have_passed(line, slot, swath, thresholds))(lines.model, slots)
         model, wiped = wiping.wipe_lines(
             lines.model,
+            affected,
             lambda line, slot: wiping.passed_through(line, slot, swath, pose.cov, thresholds, noise),
             thresholds,
         )
         gone = wiping.passed_circles(circles, swath, pose.cov, thresholds, noise)
     else:
         triangles = wiping.triangles_of_scan(points, pose, lines.model, lines.targets, thresholds)
-        model, wiped = wiping.wipe_lines(
-            lines.model, lambda line, slot: wiping.inside_triangles(line, slot, triangles), thresholds
-        )
+
+        def inside(line: Lines, slot: Array) -> wiping.Stretches:
+            return wiping.inside_triangles(line, slot, triangles)
+
+        affected = jax.vmap(lambda line, slot: jnp.any(inside(line, slot)[2]))(lines.model, slots)
+        model, wiped = wiping.wipe_lines(lines.model, affected, inside, thresholds)
         gone = wiping.circles_inside_triangles(circles, triangles)
     return _Sweep(neutral_where_free(model), wiped, gone)
 

@@ -65,53 +65,47 @@ def choose(first: Bool[Array, " K"], a: SlotsT, b: SlotsT) -> SlotsT:
 
 
 def take(slots: SlotsT, index: Int[Array, "*s"]) -> SlotsT:
-    """The lines or circles in some slots; an index of -1 gives something finite that means nothing.
-
-    All floats go through one gather, not one for each field: what XLA compiles and starts are kernels.
-    """
-    floats, back = _packed(slots)
-    rows = back(floats[index])
-    return dataclasses.replace(
-        rows,
-        **{name: getattr(slots, name)[index] for name in _DISCRETE if hasattr(slots, name)},
-    )
+    """The lines or circles in some slots; an index of -1 gives something finite that means nothing."""
+    columns, back = _packed(slots)
+    return back(columns[:, index], slots, lambda x: x[index])
 
 
 def put(slots: SlotsT, index: Int[Array, " M"], rows: SlotsT) -> SlotsT:
     """Lines or circles written into some slots; an index of -1 writes nothing. No index but -1 may occur twice."""
     into = jnp.where(index < 0, slots.valid.shape[0], index)
-    floats, back = _packed(slots)
-    floats = floats.at[into].set(_packed(rows)[0], mode="drop")
-    discrete = {
-        name: getattr(slots, name).at[into].set(getattr(rows, name), mode="drop")
-        for name in _DISCRETE
-        if hasattr(slots, name)
-    }
-    return dataclasses.replace(back(floats), **discrete)
+    columns, back = _packed(slots)
+    columns = columns.at[:, into].set(_packed(rows)[0], mode="drop")
+    discrete = {name: getattr(slots, name).at[into].set(getattr(rows, name), mode="drop") for name in _discrete(slots)}
+    return dataclasses.replace(back(columns, slots, lambda x: x), **discrete)
 
 
-_DISCRETE = ("times_detected", "fitted", "valid")
+def _discrete(slots: SlotsT) -> list[str]:
+    """The fields that are not floats."""
+    return [field.name for field in dataclasses.fields(slots) if field.name in ("times_detected", "fitted", "valid")]
 
 
-def _packed(slots: SlotsT) -> tuple[Float[Array, "K P"], Callable[[Array], SlotsT]]:
-    """All floats of each slot in one row, and the way back; the other fields are left as they are."""
+def _packed(slots: SlotsT) -> tuple[Float[Array, "P K"], Callable[..., SlotsT]]:
+    """All floats of the slots in one array, and the way back.
+
+    One gather or scatter then serves all fields: what costs time, and most of all compile time, is the number of
+    kernels. The slots are on the minor axis, so that each number of them is contiguous for whoever reads it next.
+    """
     k = slots.valid.shape[0]
-    names = [field.name for field in dataclasses.fields(slots) if field.name not in _DISCRETE]
+    discrete = _discrete(slots)
+    names = [field.name for field in dataclasses.fields(slots) if field.name not in discrete]
     shapes = [getattr(slots, name).shape[1:] for name in names]
-    sizes = [math.prod(shape) for shape in shapes]
-    packed = jnp.concatenate([getattr(slots, name).reshape(k, -1) for name in names], -1)
+    ends = list(itertools.accumulate(math.prod(shape) for shape in shapes))
+    columns = jnp.concatenate([getattr(slots, name).reshape(k, -1).T for name in names])
 
-    def back(rows: Array) -> SlotsT:
-        parts = jnp.split(rows, list(itertools.accumulate(sizes))[:-1], -1)
-        return dataclasses.replace(
-            slots,
-            **{
-                name: part.reshape(*rows.shape[:-1], *shape)
-                for name, part, shape in zip(names, parts, shapes, strict=True)
-            },
-        )
+    def back(columns: Array, others: SlotsT, select: Callable[[Array], Array]) -> SlotsT:
+        parts = jnp.split(columns, ends[:-1])
+        floats = {
+            name: jnp.moveaxis(part, 0, -1).reshape(*columns.shape[1:], *shape)
+            for name, part, shape in zip(names, parts, shapes, strict=True)
+        }
+        return dataclasses.replace(others, **floats, **{name: select(getattr(others, name)) for name in discrete})
 
-    return packed, back
+    return columns, back
 
 
 def resize(slots: SlotsT, capacity: int) -> SlotsT:

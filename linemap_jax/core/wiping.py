@@ -149,6 +149,26 @@ def passed_through(
     return jnp.minimum(along[:-1], along[1:]), jnp.maximum(along[:-1], along[1:]), gone
 
 
+def may_have_passed(line: Lines, slot: Int[Array, ""], swath: Swath, thresholds: Thresholds) -> Bool[Array, ""]:
+    """Whether `passed_through` can find anything: false for nearly all lines of a map, and cheap to tell.
+
+    Two beams must pass a line by `match_distance`, or reach behind it; no spread is computed, and nothing divided.
+    """
+    points = swath.points
+    normal, tangent = line.normal, line.tangent
+    start = swath.robot - line.anchor + points.laser
+    incidence = dot(points.beam, normal[None])
+    # Everything below is multiplied by the absolute value of the incidence.
+    to_line = jnp.sign(incidence) * (line.offset - dot(normal, start))
+    incidence = jnp.abs(incidence)
+    along = dot(tangent, start) * incidence + to_line * dot(points.beam, tangent[None])
+    on_line = (along > line.extent[0] * incidence) & (along < line.extent[1] * incidence)
+    passed = to_line + thresholds.match_distance < points.range * incidence
+    behind = (to_line < swath.reach * incidence) & (swath.times >= line.times_detected)
+    passes = (to_line > 0) & on_line & (passed | behind) & (swath.own != slot) & points.valid
+    return line.valid & (jnp.sum(passes) >= 2)
+
+
 def triangles_of_scan(
     points: Points, pose: Pose, model: Lines, targets: Int[Array, " L"], thresholds: Thresholds
 ) -> Triangles:
@@ -205,7 +225,10 @@ def inside_triangles(line: Lines, slot: Int[Array, ""], triangles: Triangles) ->
 
 
 def wipe_lines(
-    model: Lines, stretches: Callable[[Lines, Int[Array, ""]], Stretches], thresholds: Thresholds
+    model: Lines,
+    affected: Bool[Array, " K"],
+    stretches: Callable[[Lines, Int[Array, ""]], Stretches],
+    thresholds: Thresholds,
 ) -> tuple[Lines, Wiped]:
     """Take the stretches that are gone out of the lines of the map: delete, trim, split (section 6.3).
 
@@ -213,13 +236,11 @@ def wipe_lines(
 
     Args:
       model: the lines of the map.
+      affected: the lines that may have to be cut; the others are not looked at.
       stretches: which stretches of a line are gone, given the line (no batch axis) and its slot.
       thresholds: `min_length`.
     """
     k = model.valid.shape[0]
-    slots = jnp.arange(k, dtype=jnp.int32)
-    cut = jax.vmap(lambda line, slot: jnp.any(stretches(line, slot)[2]))(model, slots)
-
     def unfinished(carry: tuple[Lines, Array, Array]) -> Array:
         return jnp.any(carry[1])
 
@@ -242,7 +263,7 @@ def wipe_lines(
         outcome = jnp.stack([pieces == 1, pieces > 1, pieces == 0, lost]) & cut
         return lines, todo.at[slot].set(False), counts + outcome.astype(counts.dtype)
 
-    model, _, counts = jax.lax.while_loop(unfinished, step, (model, cut, jnp.zeros(4, jnp.int32)))
+    model, _, counts = jax.lax.while_loop(unfinished, step, (model, affected, jnp.zeros(4, jnp.int32)))
     return model, Wiped(trimmed=counts[0], split=counts[1], deleted=counts[2], overflow=counts[3] > 0)
 
 

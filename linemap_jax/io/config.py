@@ -13,6 +13,9 @@ from linemap_jax.core.settings import Rules, SensorNoise, Thresholds
 SECTIONS: dict[str, type] = {"thresholds": Thresholds, "noise": SensorNoise, "rules": Rules}
 """The tables of a settings file, and what their keys are the fields of."""
 
+POSITIVE = {"range_sigma"}
+"""Keys that may not be zero: without noise in the ranges every covariance would be singular."""
+
 
 class ConfigError(Exception):
     """What is wrong with a settings file: one sentence that names the file and the cause."""
@@ -50,8 +53,9 @@ def read_config(path: str | os.PathLike[str]) -> dict[str, dict[str, Any]]:
             if isinstance(value, bool) != is_switch or not isinstance(value, int | float):
                 kind = "true or false" if is_switch else "a number"
                 raise ConfigError(f"{os.fspath(path)}: {key} in [{section}] must be {kind}, not {value!r}")
-            if not is_switch and not 0 <= value < float("inf"):
-                raise ConfigError(f"{os.fspath(path)}: {key} in [{section}] must be zero or positive, not {value}")
+            if not is_switch and not (0 <= value < float("inf") and (value > 0 or key not in POSITIVE)):
+                kind = "positive" if key in POSITIVE else "zero or positive"
+                raise ConfigError(f"{os.fspath(path)}: {key} in [{section}] must be {kind}, not {value}")
     return tables
 
 

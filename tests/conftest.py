@@ -1,0 +1,44 @@
+"""How the tests run: on the CPU, in float64 unless a test says otherwise, every annotated shape checked at run time."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+# Before jax is loaded. The log level hides what jaxlib prints, at level "error", whenever it reads its cache.
+os.environ["JAX_PLATFORMS"] = "cpu"
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+
+import jax
+import pytest
+from jaxtyping import install_import_hook
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def modules_to_check() -> list[str]:
+    """What computes, but for the classes of `state`: they say the shape of one item, and a stack of items has more."""
+    package = ROOT / "linemap_jax"
+    files = [package / "build.py", *package.glob("core/**/*.py"), *package.glob("lab/**/*.py")]
+    names = [".".join(file.relative_to(ROOT).with_suffix("").parts) for file in files if file.name != "__init__.py"]
+    return [name for name in names if name != "linemap_jax.core.state"]
+
+
+# The whole tower of PEP 484: where a float is asked for, an int will do, as for every static checker.
+install_import_hook(modules_to_check(), "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))")
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+@pytest.fixture(scope="session")
+def data() -> Callable[[str], Path]:
+    """Gives the path of a real log in $LINEMAP_DATA, and skips the test where it is not there."""
+    folder = Path(os.environ.get("LINEMAP_DATA", ROOT / "../shared/data"))
+
+    def find(name: str) -> Path:
+        path = folder / name
+        if not path.exists():
+            pytest.skip(f"no {name} in {folder} ($LINEMAP_DATA): the test on this real data is left out")
+        return path
+
+    return find

@@ -1,0 +1,62 @@
+"""The README keeps its word: its Python runs, and its tables are complete."""
+
+import dataclasses
+import re
+import subprocess
+import sys
+from importlib import resources
+from pathlib import Path
+
+import pytest
+
+from linemap_jax import Rules
+from linemap_jax.cli import Build, Demo, Extract
+
+README = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
+
+
+def table_below(heading: str, text: str = README) -> dict[str, list[str]]:
+    """The rows of the first table after a heading: first cell, without its ticks, to the other cells."""
+    below = text.split(f"\n## {heading}\n")[1]
+    rows = re.search(r"(?:^\|.*\n)+", below, re.MULTILINE)
+    assert rows is not None
+    cells = [re.split(r"(?<!\\)\|", row)[1:-1] for row in rows[0].splitlines()[2:]]
+    return {first.replace("`", "").strip(): [cell.strip() for cell in others] for first, *others in cells}
+
+
+def test_the_python_runs_as_a_user_would_run_it(tmp_path):
+    code = "\n".join(re.findall(r"^```python\n(.*?)^```", README, re.MULTILINE | re.DOTALL))
+    assert "build_chunks" in code
+    demo = resources.files("linemap_jax.io").joinpath("data", "demo.log.gz")
+    (tmp_path / "my.log.gz").write_bytes(demo.read_bytes())
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    said = re.match(r"\[(\S+)\] \[(\S+)\]\n1 \[\[", done.stdout)
+    assert said is not None, done.stdout
+    assert [float(number) for number in said.groups()] == pytest.approx([4, 0], abs=0.01)
+    assert (tmp_path / "map.json").stat().st_size > 10_000
+
+
+def test_the_table_of_options_is_complete():
+    told = {re.findall(r"--([a-z-]+)", option)[0].replace("-", "_") for option in table_below("From a log to a map")}
+    fields = {field.name for kind in (Build, Extract, Demo) for field in dataclasses.fields(kind)}
+    assert told == fields - {"log"}
+
+
+@pytest.mark.parametrize("option", ["pose_sigma", "range_min", "every", "preset", "jacobians", "dtype"])
+def test_the_defaults_of_the_options_are_those_of_the_command(option):
+    rows = table_below("From a log to a map").items()
+    told = next(cells[0] for name, cells in rows if f"--{option.replace('_', '-')} " in name)
+    default = next(field.default for field in dataclasses.fields(Build) if field.name == option)
+    words = default if isinstance(default, tuple) else (default,)
+    assert told.strip("`") == " ".join(f"{word:g}" if isinstance(word, float) else str(word) for word in words)
+
+
+def test_the_table_of_departures_is_complete():
+    assert list(table_below("The two presets")) == [field.name for field in dataclasses.fields(Rules)]
+
+
+def test_the_place_of_the_measured_table_is_there():
+    assert README.count("<!-- measured:begin -->") == README.count("<!-- measured:end -->") == 1
