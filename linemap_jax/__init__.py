@@ -4,6 +4,12 @@ The names below stand in the order of the pipeline. Files and pictures are in `l
 `linemap_jax.lab`; importing this module loads neither.
 """
 
+import os
+
+# Read by jaxlib when it is loaded, which is below. Without it jaxlib prints long lines, at level "error", about
+# features of the CPU whenever compiled code comes from the cache on the disk. Real faults still come as exceptions.
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+
 from linemap_jax.build import build, build_chunks
 from linemap_jax.core.extract import extract
 from linemap_jax.core.lines import rho_theta

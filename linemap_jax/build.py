@@ -66,13 +66,11 @@ def build(
         raise ValueError(f"scans must be stacked, with ranges [T, N], not {scans.ranges.shape}")
     pieces = ((_slice(scans, i, i + chunk), _slice(poses, i, i + chunk)) for i in range(0, count, chunk))
     reports = []
-    for line_map, report in build_chunks(
-        pieces, line_map=line_map, map_capacity=map_capacity, capacity=capacity, chunk=chunk, **options
-    ):
+    built = line_map or empty_map(map_capacity, scans.ranges.dtype)
+    for after, report in build_chunks(pieces, line_map=built, capacity=capacity, chunk=chunk, **options):
+        built = after
         reports.append(report)
-    if line_map is None:
-        line_map = empty_map(map_capacity, scans.ranges.dtype)
-    return line_map, join_reports(reports)
+    return built, join_reports(reports)
 
 
 def build_chunks(
@@ -111,13 +109,13 @@ def build_chunks(
         active = jnp.arange(chunk) < count
         scans, poses = pad_stack(scans, chunk), pad_stack(poses, chunk)
         while True:
-            grown, report = _run(line_map, scans, poses, active, capacity=capacity, **options)
+            after, report = _run(line_map, scans, poses, active, capacity=capacity, **options)
             full = Status(int(np.bitwise_or.reduce(np.asarray(report.status))))
-            line_map, capacity, again = _grow(line_map, capacity, full)
-            if not again:
+            if not full & ~Status.POSE_NOT_FINITE:
                 break
-        line_map = grown
-        yield line_map, _slice(report, 0, count)
+            line_map, capacity = _grow_map(line_map, full), _grow_scan(capacity, full)
+        line_map = after
+        yield after, _slice(report, 0, count)
 
 
 def extract_chunk(
@@ -163,19 +161,18 @@ def _run(
     return jax.lax.scan(step, line_map, (scans, poses, active))
 
 
-def _grow(line_map: LineMap, capacity: Capacity, full: Status) -> tuple[LineMap, Capacity, bool]:
-    """Twice the room where it ran out, and whether it did anywhere."""
-    capacity = _grow_scan(capacity, full)
+def _grow_map(line_map: LineMap, full: Status) -> LineMap:
+    """Twice the room where it ran out."""
+    lines, circles = line_map.lines, line_map.circles
     if full & Status.MAP_LINES_FULL:
-        lines = line_map.lines
-        line_map = dataclasses.replace(line_map, lines=resize(lines, 2 * lines.valid.shape[0]))
+        lines = resize(lines, 2 * lines.valid.shape[0])
     if full & Status.MAP_CIRCLES_FULL:
-        circles = line_map.circles
-        line_map = dataclasses.replace(line_map, circles=resize(circles, 2 * circles.valid.shape[0]))
-    return line_map, capacity, bool(full & ~Status.POSE_NOT_FINITE)
+        circles = resize(circles, 2 * circles.valid.shape[0])
+    return LineMap(lines=lines, circles=circles)
 
 
 def _grow_scan(capacity: Capacity, full: Status) -> Capacity:
+    """Twice the room where it ran out."""
     lines = 2 * capacity.lines if full & Status.SCAN_LINES_FULL else capacity.lines
     circles = 2 * capacity.circles if full & Status.SCAN_CIRCLES_FULL else capacity.circles
     return Capacity(lines, circles)

@@ -579,6 +579,13 @@ def test_an_interrupt_while_writing_leaves_nothing_half(run, log, tmp_path, monk
 # --- The process -----------------------------------------------------------------------------------------------------
 
 
+def test_a_second_start_says_nothing_about_the_cache(log, tmp_path, monkeypatch):
+    monkeypatch.delenv("TF_CPP_MIN_LOG_LEVEL", raising=False)
+    for name in ("first", "second"):
+        done = command("extract", log, "-o", tmp_path / f"{name}.jsonl", "--quiet")
+        assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
 def test_bad_input_to_the_real_command(tmp_path):
     done = command("build", tmp_path / "none.log", "-o", tmp_path / "out")
     assert done.returncode == 2

@@ -58,7 +58,7 @@ def cluster(points: Points, free: Bool[Array, " N"], thresholds: Thresholds) -> 
         x0, y0 = jnp.where(joins, c.x0, px), jnp.where(joins, c.y0, py)
         x, y = px - x0, py - y0
         old = jnp.where(joins, 1, 0).astype(carry.dtype)
-        joined = Cluster(c.n * old + 1, x0, y0, c.x * old + x, c.y * old + y, c.xxyy * old + (x * x + y * y))
+        joined = [c.n * old + 1, x0, y0, c.x * old + x, c.y * old + y, c.xxyy * old + (x * x + y * y)]
         carry = jnp.stack(joined) * is_free  # a point of a line ends the cluster
         return carry, carry
 
@@ -172,7 +172,7 @@ def _fit_circles(
         e = to_point / jnp.where(distance > 0, distance, 1)[:, None]
         return distance - mine[:, 2], e, jnp.concatenate([-e, -jnp.ones_like(e[:, :1])], -1)
 
-    def step(_: int, circle: Array) -> Array:
+    def step(_: Array, circle: Array) -> Array:
         residual, _, rows = linearise(circle)
         # A^T A and A^T f in one sum
         sums = clusters.sum(rows[:, :, None] * jnp.concatenate([rows, residual[:, None]], -1)[:, None, :])

@@ -67,8 +67,8 @@ def extract(
       ValueError: at trace time, for an option that does not exist.
     """
     dtype = scan.ranges.dtype
-    defaults = (thresholds or Thresholds(), noise or SensorNoise(), mount or Mount(), pose)
-    thresholds, noise, mount, pose = as_dtype(defaults, dtype)
+    thresholds, noise, mount = with_defaults(thresholds, noise, mount, dtype)
+    pose = as_dtype(pose, dtype)
     scan, pose, finite = usable(scan, pose)
     points = points_from_scan(scan, pose, mount, jacobians=jacobians)
     found = extract_points(
@@ -123,9 +123,7 @@ def extract_points(
     cluster_ends, cluster = circles_.cluster(points, points.valid & (runs.of_point < 0), thresholds)
     lone = cluster.n < 2
     clusters, circles_full = select_runs(cluster.n, cluster_ends & ~lone, capacity.circles)
-    circles = circles_.measure_circles(
-        points, pose, clusters, cluster, thresholds, noise, fit=rules.fit_circles
-    )
+    circles = circles_.measure_circles(points, pose, clusters, cluster, thresholds, noise, fit=rules.fit_circles)
     near = circles_.near_lines(circles, lines, thresholds)
     circles = dataclasses.replace(circles, valid=circles.valid & ~near)
 
@@ -155,6 +153,14 @@ def extract_points(
         ),
         status=status.astype(jnp.int32),
     )
+
+
+def with_defaults(
+    thresholds: Thresholds | None, noise: SensorNoise | None, mount: Mount | None, dtype: Any
+) -> tuple[Thresholds, SensorNoise, Mount]:
+    """The settings as arrays of one dtype, the defaults where none are given."""
+    settings = (thresholds or Thresholds(), noise or SensorNoise(), mount or Mount())
+    return as_dtype(settings, dtype)
 
 
 def as_dtype(tree: Any, dtype: Any) -> Any:

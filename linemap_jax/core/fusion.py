@@ -61,7 +61,9 @@ def fuse_lines(
         weight = product(shift.T, inverse(with_sign(cov, pair.sign)))
         turned = jac * jnp.stack([pair.sign, jnp.ones_like(pair.sign)])[:, None]
         innovation = jnp.stack([pair.offset, pair.angle])
-        return jnp.concatenate([product(weight, shift), product(weight, turned), apply(weight, innovation)[:, None]], -1)
+        return jnp.concatenate(
+            [product(weight, shift), product(weight, turned), apply(weight, innovation)[:, None]], -1
+        )
 
     parts = jax.vmap(in_map)(pieces.lines, model, pieces.cov_measurement, pieces.jac_line_pose)
     member = together.astype(parts.dtype)
@@ -176,9 +178,7 @@ def fuse_circles(model: Circles, new: Circles, matches: CircleMatches, rules: Ru
             joint,
             jnp.where(has_fit[:, None], seen, jnp.where(model.fitted[:, None], old, running)),
         )
-        cov = jnp.where(
-            both[:, None, None], cov_both, jnp.where(has_fit[:, None, None], cov_seen, model.cov)
-        )
+        cov = jnp.where(both[:, None, None], cov_both, jnp.where(has_fit[:, None, None], cov_seen, model.cov))
         fitted = model.fitted | has_fit
 
     return dataclasses.replace(

@@ -82,8 +82,8 @@ def regress(position: Float[Array, "N 2"], runs: Runs) -> Regression:
 def line_from_regression(fit: Regression, anchor: Float[Array, "K 2"]) -> Float[Array, "2 K"]:
     """Offset and angle of each line at an anchor: Eqs. (9)-(10) with the anchor for an origin.
 
-    Departures from the paper: no absolute value in Eq. (9), since the offset is signed; the four-quadrant arctangent for
-    Eq. (10), which is undefined as printed for a line through the origin.
+    Departures from the paper: no absolute value in Eq. (9), since the offset is signed; the four-quadrant arctangent
+    for Eq. (10), which is undefined as printed for a line through the origin.
 
     Args:
       fit: the regressions.
@@ -280,8 +280,8 @@ def _var_extent(
 def rho_theta(lines: Lines) -> tuple[Float[Array, " K"], Float[Array, " K"], Float[Array, "K 2 2"]]:
     """The paper's view of a line, Eq. (1): the normal form with respect to the origin of the world.
 
-    For display and export. Near the origin rho >= 0 turns theta by pi, and far from it the covariance of the view fails,
-    in float64 too (mean NEES 2.3 at 100 m, 29 at 1 km): compare and fuse lines at an anchor, not here.
+    For display and export. Near the origin rho >= 0 turns theta by pi, and far from it the covariance of the view
+    fails, in float64 too (mean NEES 2.3 at 100 m, 29 at 1 km): compare and fuse lines at an anchor, not here.
 
     Args:
       lines: `K` lines.

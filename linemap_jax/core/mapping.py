@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Int
 
 from linemap_jax.core import fusion, matching, wiping
 from linemap_jax.core.circles import near_lines
-from linemap_jax.core.extract import as_dtype, extract_points, usable
+from linemap_jax.core.extract import as_dtype, extract_points, usable, with_defaults
 from linemap_jax.core.sensor import Points, points_from_scan
 from linemap_jax.core.settings import (
     SCAN_CAPACITY,
@@ -90,8 +90,8 @@ def update(
     dtype = scan.ranges.dtype
     if line_map.lines.cov.dtype != dtype:
         raise ValueError(f"the map is {line_map.lines.cov.dtype} and the scan {dtype}; make both the same")
-    defaults = (thresholds or Thresholds(), noise or SensorNoise(), mount or Mount(), pose)
-    thresholds, noise, mount, pose = as_dtype(defaults, dtype)
+    thresholds, noise, mount = with_defaults(thresholds, noise, mount, dtype)
+    pose = as_dtype(pose, dtype)
     scan, pose, finite = usable(scan, pose)
     points = points_from_scan(scan, pose, mount, jacobians=jacobians)
     found = extract_points(
@@ -146,9 +146,7 @@ class _LineUpdate(NamedTuple):
     overflow: Array
 
 
-def _update_lines(
-    model: Lines, found: Extraction, pose: Pose, thresholds: Thresholds, rules: Rules
-) -> _LineUpdate:
+def _update_lines(model: Lines, found: Extraction, pose: Pose, thresholds: Thresholds, rules: Rules) -> _LineUpdate:
     """Section 5.1: match, then fuse or add, then merge."""
     new = found.lines
     if rules.share_pose:
@@ -265,7 +263,9 @@ def _sweep(
         line_of_point = jnp.where(points.valid, found.line_of_beam[points.index], -1)
         times = jnp.where(lines.targets >= 0, lines.model.times_detected[lines.targets], 0)
         swath = wiping.swath_of_scan(points, pose, line_of_point, found.lines, lines.own, times, thresholds)
-        affected = jax.vmap(lambda line, slot: wiping.may_have_passed(line, slot, swath, thresholds))(lines.model, slots)
+        affected = jax.vmap(lambda line, slot: wiping.may_have_passed(line, slot, swath, thresholds))(
+            lines.model, slots
+        )
         model, wiped = wiping.wipe_lines(
             lines.model,
             affected,

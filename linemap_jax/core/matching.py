@@ -17,7 +17,7 @@ from linemap_jax.core.slots import least, take
 from linemap_jax.core.state import Circles, Lines, pytree
 
 OVERLAP_WEIGHT = 1e-3
-"""1/m: a metre more of overlap counts like this much less of the normalised distance. It decides between equals only."""
+"""1/m: a metre more of overlap counts like this much less of the normalised distance. It decides between equals."""
 
 
 @pytree
@@ -211,7 +211,6 @@ def match_circles(new: Circles, model: Circles, thresholds: Thresholds, rules: R
     The nearest is taken. The paper's one criterion is the distance of the centres; fitted circles have a covariance,
     and by default must pass a chi-square gate on centre and radius too.
     """
-
     step = new.center[:, None] - model.center[None]
     near = new.valid[:, None] & model.valid[None]
     distance = jnp.where(near, jnp.sqrt(dot(step, step)), jnp.inf)

@@ -14,7 +14,7 @@ def jacobian(
     derivative: Callable[[Float[Array, " n"]], Float[Array, "m n"]],
     jacobians: Jacobians,
 ) -> Callable[[Float[Array, " n"]], Float[Array, "m n"]]:
-    """The Jacobian of a function: `autodiff` through the function itself, or `analytic`, the hand-derived one beside it.
+    """The Jacobian of a function: `autodiff` through the function, or `analytic`, the hand-derived one beside it.
 
     Raises:
       ValueError: if `jacobians` is neither.

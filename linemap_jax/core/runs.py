@@ -33,9 +33,7 @@ class Runs:
         return per_run[self.of_point]
 
 
-def select_runs(
-    count: Float[Array, " N"], chosen: Bool[Array, " N"], capacity: int
-) -> tuple[Runs, Bool[Array, ""]]:
+def select_runs(count: Float[Array, " N"], chosen: Bool[Array, " N"], capacity: int) -> tuple[Runs, Bool[Array, ""]]:
     """Give slots to some runs, in order.
 
     Args:

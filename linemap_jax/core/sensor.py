@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from linemap_jax.core.frames import perp, rotate, unit
+from linemap_jax.core.frames import rotate, unit
 from linemap_jax.core.propagation import jacobian, propagate
 from linemap_jax.core.settings import Jacobians, Mount, SensorNoise
 from linemap_jax.core.slots import all_true
@@ -41,7 +41,7 @@ class Points:
 def point_from_measurement(
     pose: Float[Array, "3"], measurement: Float[Array, "2"], mount: Float[Array, "3"]
 ) -> Float[Array, "2"]:
-    """f of Eq. (3): a measured point in the world.
+    """F of Eq. (3): a measured point in the world.
 
     Eq. (2), with the turn of the scanner on the robot added to the bearing (the paper's scanner looks ahead).
 

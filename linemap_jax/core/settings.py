@@ -6,7 +6,7 @@ of its thresholds (30 cm, and 5 in Eq. (22)); the other values of `paper` are ou
 """
 
 import dataclasses
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, dataclass_transform
 
 import chex
 from jaxtyping import Array, Float
@@ -80,7 +80,12 @@ class SensorNoise:
     """Of a bearing, rad."""
 
 
-@chex.dataclass(frozen=True, mappable_dataclass=False)
+@dataclass_transform(frozen_default=True)
+def _positional(cls: type) -> Any:
+    return chex.dataclass(frozen=True, mappable_dataclass=False)(cls)
+
+
+@_positional
 class Mount:
     """Where the scanner sits on the robot: its pose in the robot's frame, Eq. (2)."""
 
@@ -114,10 +119,10 @@ class Rules:
     """Fit a circle to a cluster where there are points enough. Eqs. (18)-(20) describe the visible arc: a centre that
     lies before the pole's and moves with the viewpoint."""
     share_pose: bool = True
-    """Pieces of one line in one scan share its pose error: it is counted once, not once a piece."""
+    """Pieces of one line in one scan share its pose error: it is counted once."""
     leave_out_ambiguous: bool = True
-    """A new line that passes the geometric gates but fails the statistical one is neither fused nor added. To add it, as
-    the paper does, holds the same wall twice: the gate turns true matches away too."""
+    """A new line that passes the geometric gates but fails the statistical one is neither fused nor added. To add
+    it, as the paper does, holds the same wall twice: the gate turns true matches away too."""
     merge: bool = True
     """Lines of the map that overlap and agree become one."""
     estimate_ends: bool = True

@@ -8,6 +8,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -55,8 +56,7 @@ def free_slots(wanted: Bool[Array, " M"], taken: Bool[Array, " K"]) -> tuple[Int
 
 def neutral_where_free(slots: SlotsT) -> SlotsT:
     """The same lines or circles with neutral values in every free slot, so that nothing non-finite lurks there."""
-    empty = empty_lines if isinstance(slots, Lines) else empty_circles
-    return choose(slots.valid, slots, empty(slots.valid.shape[0], slots.cov.dtype))
+    return choose(slots.valid, slots, _empty_like(slots, slots.valid.shape[0]))
 
 
 def choose(first: Bool[Array, " K"], a: SlotsT, b: SlotsT) -> SlotsT:
@@ -117,6 +117,9 @@ def resize(slots: SlotsT, capacity: int) -> SlotsT:
     have = slots.valid.shape[0]
     if capacity < have:
         raise ValueError(f"cannot shrink {have} slots to {capacity}")
-    empty = empty_lines if isinstance(slots, Lines) else empty_circles
-    dtype = slots.cov.dtype
-    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), slots, empty(capacity - have, dtype))
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), slots, _empty_like(slots, capacity - have))
+
+
+def _empty_like(slots: SlotsT, capacity: int) -> SlotsT:
+    empty: Any = empty_lines if isinstance(slots, Lines) else empty_circles
+    return empty(capacity, slots.cov.dtype)

@@ -92,6 +92,7 @@ class Pose:
     cov: Float[Array, "3 3"]  # m^2, m rad, rad^2
 
     def __post_init__(self) -> None:
+        """Lists of numbers become arrays."""
         # Lists are a convenience of the notebook; a list inside a pytree would be a subtree, not an array.
         for name in ("mean", "cov"):
             value = getattr(self, name)

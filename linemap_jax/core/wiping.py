@@ -19,7 +19,7 @@ from linemap_jax.core.frames import dot, perp, reanchor
 from linemap_jax.core.matching import normal_variance
 from linemap_jax.core.propagation import quadratic
 from linemap_jax.core.sensor import Points
-from linemap_jax.core.settings import SensorNoise, Thresholds
+from linemap_jax.core.settings import Number, SensorNoise, Thresholds
 from linemap_jax.core.slots import all_true, first_true, put, rank_of_true, take
 from linemap_jax.core.state import Circles, Lines, Pose, pytree
 
@@ -103,7 +103,12 @@ def swath_of_scan(
 
 
 def passed_through(
-    line: Lines, slot: Int[Array, ""], swath: Swath, cov_pose: Float[Array, "3 3"], thresholds: Thresholds, noise: SensorNoise
+    line: Lines,
+    slot: Int[Array, ""],
+    swath: Swath,
+    cov_pose: Float[Array, "3 3"],
+    thresholds: Thresholds,
+    noise: SensorNoise,
 ) -> Stretches:
     """The stretches of a line of the map between neighbouring beams that both passed through it.
 
@@ -131,9 +136,7 @@ def passed_through(
 
     # n^T F C_pose F^T n with F = [I, perp(hit)]
     lever = dot(perp(points.laser[None] + distance[:, None] * points.beam), normal[None])
-    by_pose = (
-        quadratic(normal, cov_pose[:2, :2]) + 2 * lever * dot(normal, cov_pose[:2, 2]) + lever**2 * cov_pose[2, 2]
-    )
+    by_pose = quadratic(normal, cov_pose[:2, :2]) + 2 * lever * dot(normal, cov_pose[:2, 2]) + lever**2 * cov_pose[2, 2]
     by_bearing = (distance * noise.bearing_sigma * sideways) ** 2
     # How far beyond the line the beam ended, along the line's normal, against the spread of that.
     beyond = (points.range - distance) * jnp.abs(incidence)
@@ -241,6 +244,7 @@ def wipe_lines(
       thresholds: `min_length`.
     """
     k = model.valid.shape[0]
+
     def unfinished(carry: tuple[Lines, Array, Array]) -> Array:
         return jnp.any(carry[1])
 
@@ -268,7 +272,7 @@ def wipe_lines(
 
 
 def remaining(
-    extent: Float[Array, "2"], gone: Stretches, min_length: Float[Array, ""]
+    extent: Float[Array, "2"], gone: Stretches, min_length: Number
 ) -> tuple[Float[Array, " P"], Float[Array, " P"], Bool[Array, " P"]]:
     """What is left of a segment, in order along it.
 

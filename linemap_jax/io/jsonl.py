@@ -13,8 +13,8 @@ from linemap_jax.core.state import Extraction, Pose
 def lines_of_extraction(timestamps: np.ndarray, poses: Pose, found: Extraction) -> Iterator[str]:
     """One JSON object a scan: `timestamp`, `pose`, `lines`, `circles`.
 
-    A line has `rho`, `theta`, `cov` of both, `begin`, `end`; a circle `center`, `radius`, and `cov` of (x, y, radius) if
-    it is fitted. SI units, radians, counter-clockwise.
+    A line has `rho`, `theta`, `cov` of both, `begin`, `end`; a circle `center`, `radius`, and `cov` of (x, y, radius)
+    if it is fitted. SI units, radians, counter-clockwise.
 
     Args:
       timestamps: seconds. Shape `[T]`.

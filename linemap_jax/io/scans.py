@@ -48,7 +48,9 @@ def chunks_of_readings(
         # NaN compares false, so it is masked too.
         valid = (ranges > 0) & (ranges >= range_min) & (ranges < range_max) & np.isfinite(ranges)
         bearings = np.stack([reading.bearings for reading in batch])
-        spacing = np.median(np.abs(np.diff(bearings, axis=1)), axis=1) if bearings.shape[1] > 1 else np.zeros(len(batch))
+        spacing = (
+            np.median(np.abs(np.diff(bearings, axis=1)), axis=1) if bearings.shape[1] > 1 else np.zeros(len(batch))
+        )
         yield Chunk(
             scans=Scan(
                 ranges=jnp.asarray(np.where(valid, ranges, 0), dtype),

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from linemap_jax.core.frames import dot
-from linemap_jax.core.settings import Jacobians, Mount
 from linemap_jax.core.sensor import points_from_scan
+from linemap_jax.core.settings import Jacobians, Mount
 from linemap_jax.core.state import LineMap, Lines, Pose, Scan, pad_stack
 
 
