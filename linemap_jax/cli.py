@@ -94,6 +94,9 @@ class Demo:
 DEMO_NOISE = {"range_sigma": 0.015, "bearing_sigma": 0.0005, "pose_sigma": (0.01, 0.01, 0.002)}
 """What the demo log was made with."""
 
+START_CAPACITY = (512, 256)
+"""Slots for lines and circles to begin with. To grow costs a compilation, and most buildings fit into these."""
+
 COUNTS = ("added", "fused", "merged", "trimmed", "split", "deleted")
 """The counts of a `Report`."""
 
@@ -147,6 +150,7 @@ def _of_demo(demo: Demo) -> Build:
 def _build(command: Build) -> int:
     options = _options(command)
     from linemap_jax.core.settings import Mount
+    from linemap_jax.core.state import Status
     from linemap_jax.io.map_file import write_map
     from linemap_jax.io.plot import plot_map
 
@@ -159,6 +163,9 @@ def _build(command: Build) -> int:
     with _progress(command, log):
         line_map, report, positions, seconds, interrupted = _map_of_log(command, log, options)
     _warn(command, log)
+    lost = int(((report.status & Status.POSE_NOT_FINITE) != 0).sum())
+    if lost:
+        _say(command, f"warning: {log.path}: {lost} scans were left out: their poses are not finite in {command.dtype}")
 
     settings = {
         "log": command.log.name,
@@ -185,7 +192,9 @@ def _map_of_log(
     And whether somebody interrupted it: then the map is the one so far.
     """
     from linemap_jax.build import CHUNK, build_chunks, join_reports
+    from linemap_jax.core.settings import Capacity
 
+    start = Capacity(*START_CAPACITY)
     positions, reports, seconds = [], [], []
 
     def driven() -> Iterator[Any]:
@@ -196,7 +205,7 @@ def _map_of_log(
     line_map, interrupted = None, False
     started = time.perf_counter()
     try:
-        for grown, report in build_chunks(driven(), chunk=CHUNK, **options):
+        for grown, report in build_chunks(driven(), map_capacity=start, chunk=CHUNK, **options):
             line_map = grown
             reports.append(report)
             seconds.append(time.perf_counter() - started)
@@ -302,8 +311,8 @@ def _options(command: LogOptions) -> dict[str, Any]:
 def _check(command: LogOptions) -> None:
     """Refuse numbers that make no sense."""
     inf = float("inf")
-    if command.every < 1:
-        raise UsageError(f"--every must be at least 1, not {command.every}")
+    if not 1 <= command.every <= 10**9:
+        raise UsageError(f"--every must be from 1 to 10^9, not {command.every}")
     if not 0 <= command.range_min < inf:
         raise UsageError(f"--range-min must be zero or positive, not {command.range_min}")
     if command.range_max is not None and not command.range_min < command.range_max:

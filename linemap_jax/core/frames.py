@@ -28,7 +28,7 @@ def rotate(angle: Float[Array, ""], vector: Float[Array, "2"]) -> Float[Array, "
     return vector[0] * unit(angle) + vector[1] * perp(unit(angle))
 
 
-def dot(a: Float[Array, "*s 2"], b: Float[Array, "*s 2"]) -> Float[Array, "*s"]:
+def dot(a: Float[Array, "*#s 2"], b: Float[Array, "*#s 2"]) -> Float[Array, "..."]:
     """Scalar product of plane vectors."""
     return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1]
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from linemap_jax.core.state import Lines, SlotsT, empty_circles, empty_lines
@@ -117,7 +118,9 @@ def resize(slots: SlotsT, capacity: int) -> SlotsT:
     have = slots.valid.shape[0]
     if capacity < have:
         raise ValueError(f"cannot shrink {have} slots to {capacity}")
-    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), slots, _empty_like(slots, capacity - have))
+    more = _empty_like(slots, capacity - have)
+    # On the host: jax would compile a program for each field.
+    return jax.tree.map(lambda a, b: jnp.asarray(np.concatenate([a, b])), slots, more)
 
 
 def _empty_like(slots: SlotsT, capacity: int) -> SlotsT:

@@ -239,34 +239,39 @@ LEFT_OUT = -2
 
 def empty_lines(capacity: int, dtype: Any = None) -> Lines:
     """`capacity` free slots for lines. The dtype is jax's default unless given."""
-    dtype = jnp.zeros(0).dtype if dtype is None else dtype
-    return Lines(
-        anchor=jnp.zeros((capacity, 2), dtype),
-        offset=jnp.zeros(capacity, dtype),
-        angle=jnp.zeros(capacity, dtype),
-        cov=jnp.broadcast_to(jnp.eye(2, dtype=dtype), (capacity, 2, 2)),
-        extent=jnp.zeros((capacity, 2), dtype),
-        var_extent=jnp.ones((capacity, 2), dtype),
-        times_detected=jnp.zeros(capacity, jnp.int32),
-        valid=jnp.zeros(capacity, bool),
+    dtype = jnp.asarray(0.0).dtype if dtype is None else jax.dtypes.canonicalize_dtype(dtype)
+    # Filled by NumPy: outside of a jitted function, jax would compile a program for each field.
+    free = Lines(
+        anchor=np.zeros((capacity, 2), dtype),
+        offset=np.zeros(capacity, dtype),
+        angle=np.zeros(capacity, dtype),
+        cov=np.tile(np.eye(2, dtype=dtype), (capacity, 1, 1)),
+        extent=np.zeros((capacity, 2), dtype),
+        var_extent=np.ones((capacity, 2), dtype),
+        times_detected=np.zeros(capacity, np.int32),
+        valid=np.zeros(capacity, bool),
     )
+    return jax.tree.map(jnp.asarray, free)
 
 
 def empty_circles(capacity: int, dtype: Any = None) -> Circles:
     """`capacity` free slots for circles. The dtype is jax's default unless given."""
-    dtype = jnp.zeros(0).dtype if dtype is None else dtype
-    return Circles(
-        center=jnp.zeros((capacity, 2), dtype),
-        radius=jnp.zeros(capacity, dtype),
-        cov=jnp.zeros((capacity, 3, 3), dtype),
-        fitted=jnp.zeros(capacity, bool),
-        times_detected=jnp.zeros(capacity, jnp.int32),
-        valid=jnp.zeros(capacity, bool),
+    dtype = jnp.asarray(0.0).dtype if dtype is None else jax.dtypes.canonicalize_dtype(dtype)
+    free = Circles(
+        center=np.zeros((capacity, 2), dtype),
+        radius=np.zeros(capacity, dtype),
+        cov=np.zeros((capacity, 3, 3), dtype),
+        fitted=np.zeros(capacity, bool),
+        times_detected=np.zeros(capacity, np.int32),
+        valid=np.zeros(capacity, bool),
     )
+    return jax.tree.map(jnp.asarray, free)
 
 
 def pad_stack(stacked: Any, size: int) -> Any:
     """Stacked items filled up to `size` by repeating the last one; whoever uses them knows how many count."""
+    if all(x.shape[0] == size for x in jax.tree.leaves(stacked)):
+        return stacked
     return jax.tree.map(
         lambda x: jnp.concatenate([x, jnp.broadcast_to(x[-1:], (size - x.shape[0], *x.shape[1:]))]), stacked
     )

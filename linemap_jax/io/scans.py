@@ -51,6 +51,8 @@ def chunks_of_readings(
         spacing = (
             np.median(np.abs(np.diff(bearings, axis=1)), axis=1) if bearings.shape[1] > 1 else np.zeros(len(batch))
         )
+        with np.errstate(over="ignore"):  # a pose too large for float32 becomes infinite, and is reported as such
+            mean = np.stack([reading.pose for reading in batch]).astype(dtype)
         yield Chunk(
             scans=Scan(
                 ranges=jnp.asarray(np.where(valid, ranges, 0), dtype),
@@ -59,7 +61,7 @@ def chunks_of_readings(
                 spacing=jnp.asarray(spacing, dtype),
             ),
             poses=Pose(
-                mean=jnp.asarray(np.stack([reading.pose for reading in batch]), dtype),
+                mean=jnp.asarray(mean),
                 cov=jnp.broadcast_to(jnp.asarray(cov_pose, dtype), (len(batch), 3, 3)),
             ),
             timestamps=np.array([reading.timestamp for reading in batch]),
