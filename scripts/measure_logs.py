@@ -10,7 +10,7 @@ import os
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -25,6 +25,7 @@ DATA = Path(os.environ.get("LINEMAP_DATA", ROOT / "../shared/data"))
 LOGS = {"intel": "Intel", "aces": "ACES", "fhw": "FHW", "freiburg-079": "FR079"}
 COV_POSE = np.diag([0.05, 0.05, 0.01]) ** 2
 CHUNK = 64
+PRESETS: tuple[Literal["default", "paper"], ...] = ("default", "paper")
 BEGIN, END = "<!-- measured:begin -->", "<!-- measured:end -->"
 
 
@@ -37,7 +38,7 @@ def main() -> int:
             print(f"{path} is not there: left out", file=sys.stderr)
             continue
         (chunk,) = chunks_of_readings(open_log(path), 10**6, cov_pose=COV_POSE)
-        for choice in ("default", "paper"):
+        for choice in PRESETS:
             rows.append(f"| {title} | {choice} | " + " | ".join(measure((chunk.scans, chunk.poses), choice)) + " |")
             print(rows[-1], flush=True)
     columns = ("log", "preset", "scans", "lines", "circles", "explained", "held out", "median line", "seen 3 times")
@@ -51,7 +52,7 @@ def main() -> int:
     return 0
 
 
-def measure(log: tuple[Any, Any], choice: str) -> list[str]:
+def measure(log: tuple[Any, Any], choice: Literal["default", "paper"]) -> list[str]:
     """The figures of one log and preset, from the third column on."""
     options = preset(choice) | {"jacobians": "analytic", "map_capacity": Capacity(1024, 512), "chunk": CHUNK}
     build(*every(log, slice(CHUNK)), **options)  # compiles

@@ -240,32 +240,34 @@ LEFT_OUT = -2
 def empty_lines(capacity: int, dtype: Any = None) -> Lines:
     """`capacity` free slots for lines. The dtype is jax's default unless given."""
     dtype = jnp.asarray(0.0).dtype if dtype is None else jax.dtypes.canonicalize_dtype(dtype)
-    # Filled by NumPy: outside of a jitted function, jax would compile a program for each field.
-    free = Lines(
-        anchor=np.zeros((capacity, 2), dtype),
-        offset=np.zeros(capacity, dtype),
-        angle=np.zeros(capacity, dtype),
-        cov=np.tile(np.eye(2, dtype=dtype), (capacity, 1, 1)),
-        extent=np.zeros((capacity, 2), dtype),
-        var_extent=np.ones((capacity, 2), dtype),
-        times_detected=np.zeros(capacity, np.int32),
-        valid=np.zeros(capacity, bool),
+    return Lines(
+        anchor=_filled((capacity, 2), 0, dtype),
+        offset=_filled((capacity,), 0, dtype),
+        angle=_filled((capacity,), 0, dtype),
+        cov=jnp.asarray(np.tile(np.eye(2, dtype=dtype), (capacity, 1, 1))),
+        extent=_filled((capacity, 2), 0, dtype),
+        var_extent=_filled((capacity, 2), 1, dtype),
+        times_detected=_filled((capacity,), 0, np.int32),
+        valid=_filled((capacity,), False, bool),
     )
-    return jax.tree.map(jnp.asarray, free)
 
 
 def empty_circles(capacity: int, dtype: Any = None) -> Circles:
     """`capacity` free slots for circles. The dtype is jax's default unless given."""
     dtype = jnp.asarray(0.0).dtype if dtype is None else jax.dtypes.canonicalize_dtype(dtype)
-    free = Circles(
-        center=np.zeros((capacity, 2), dtype),
-        radius=np.zeros(capacity, dtype),
-        cov=np.zeros((capacity, 3, 3), dtype),
-        fitted=np.zeros(capacity, bool),
-        times_detected=np.zeros(capacity, np.int32),
-        valid=np.zeros(capacity, bool),
+    return Circles(
+        center=_filled((capacity, 2), 0, dtype),
+        radius=_filled((capacity,), 0, dtype),
+        cov=_filled((capacity, 3, 3), 0, dtype),
+        fitted=_filled((capacity,), False, bool),
+        times_detected=_filled((capacity,), 0, np.int32),
+        valid=_filled((capacity,), False, bool),
     )
-    return jax.tree.map(jnp.asarray, free)
+
+
+def _filled(shape: tuple[int, ...], value: float, dtype: Any) -> Array:
+    """By way of NumPy: outside of a jitted function, jax would compile a program for each shape."""
+    return jnp.asarray(np.full(shape, value, dtype))
 
 
 def pad_stack(stacked: Any, size: int) -> Any:
