@@ -1,0 +1,176 @@
+"""The criteria of s4.3.1 on scans made by hand: each breaks where it should, and is counted."""
+
+import dataclasses
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from linemap_jax import Capacity, Extraction, Rules, Thresholds, extract, preset
+from linemap_jax.core.state import Pose, Scan
+
+CAPACITY = Capacity(8, 8)
+HERE = Pose(mean=jnp.zeros(3), cov=jnp.zeros((3, 3)))
+N = 41
+SPACING = np.radians(1.0)
+BEARINGS = (np.arange(N) - 20) * SPACING
+WALL = 2 / np.cos(BEARINGS)
+"""A wall ahead at 2 m; its points are 3.5 cm apart, 4 cm at the ends."""
+EXACT = Thresholds(line_distance=1e-3, line_sigmas=0.0, min_length=0.1)
+"""Criterion 2 without noise: the first point off the line breaks."""
+
+
+def extracted(ranges: np.ndarray, thresholds: Thresholds | None = None, **rules: bool) -> Extraction:
+    scan = Scan.from_ranges(ranges, BEARINGS)
+    return extract(scan, HERE, thresholds=thresholds or Thresholds(), capacity=CAPACITY, rules=Rules(**rules))
+
+
+def counts(found: Extraction) -> dict[str, int]:
+    """The criteria that turned something away, and how many."""
+    named = {field.name: int(getattr(found.rejected, field.name)) for field in dataclasses.fields(found.rejected)}
+    return {name: count for name, count in named.items() if count}
+
+
+def beams(found: Extraction, line: int) -> list[int]:
+    return np.flatnonzero(np.asarray(found.line_of_beam) == line).tolist()
+
+
+def corner(at: int) -> np.ndarray:
+    """A wall that turns towards the robot, by a right angle, at the beam `at`, whose point both walls hold."""
+    ahead, aside = WALL, 2 * np.tan(BEARINGS[at]) / np.sin(np.where(BEARINGS > 0, BEARINGS, 1))
+    return np.where(np.arange(N) <= at, ahead, aside)
+
+
+def test_one_wall_is_one_line() -> None:
+    found = extracted(WALL)
+    assert beams(found, 0) == list(range(N))
+    assert counts(found) == {}
+
+
+def test_criterion_1_breaks_at_a_step() -> None:
+    ranges = np.where(np.arange(N) < 20, WALL, 1.5 * WALL)
+    found = extracted(ranges)
+    assert (beams(found, 0), beams(found, 1)) == (list(range(20)), list(range(20, N)))
+    assert counts(found) == {"gap": 1}
+
+
+@pytest.mark.parametrize(("gap", "broken"), [(0.034, True), (0.036, False)])
+def test_criterion_1_is_a_distance(gap: float, broken: bool) -> None:
+    # Successive points are 2 (tan(a + 1 deg) - tan(a)) apart: 3.49 cm ahead of the robot.
+    ranges = np.where(np.abs(np.arange(N) - 20) < 4, WALL, np.nan)
+    found = extracted(ranges, Thresholds(gap_distance=gap, gap_spacings=0.0))
+    assert counts(found).get("gap", 0) == (6 if broken else 0)
+
+
+def test_criterion_1_widens_with_the_arc() -> None:
+    # A wall that recedes: the points lie apart, since the beams graze it.
+    ranges = 0.4 / np.sin(np.radians(7) + (BEARINGS - BEARINGS[0]))[::-1]
+    steps = np.linalg.norm(np.diff(ranges * np.stack([np.cos(BEARINGS), np.sin(BEARINGS)]), axis=1), axis=0)
+    arcs = np.minimum(ranges[1:], ranges[:-1]) * SPACING
+    for spacings in (0.0, 4.0, 6.0):
+        found = extracted(ranges, Thresholds(gap_spacings=spacings))
+        expected = int(np.sum(steps >= np.maximum(0.15, spacings * arcs)))
+        assert counts(found).get("gap", 0) == expected
+    assert np.sum(steps >= 0.15) > np.sum(steps >= np.maximum(0.15, 6 * arcs))
+
+
+def test_criterion_2_breaks_at_a_corner_and_gives_the_corner_back() -> None:
+    found = extracted(corner(30), EXACT)
+    assert (beams(found, 0), beams(found, 1)) == (list(range(30)), list(range(30, N)))
+    assert counts(found) == {"distance": 1}
+    np.testing.assert_allclose(found.lines.begin[1], found.lines.end[0], atol=0.05)
+    np.testing.assert_allclose(found.lines.begin[1], [2, 2 * np.tan(BEARINGS[30])], atol=1e-9)
+
+
+def test_criterion_2_without_giving_back() -> None:
+    found = extracted(corner(30), EXACT, give_back_point=False)
+    assert (beams(found, 0), beams(found, 1)) == (list(range(31)), list(range(31, N)))
+    assert counts(found) == {"distance": 1}
+
+
+def test_a_point_given_back_keeps_bad_points_out_of_the_fit() -> None:
+    wide = Thresholds(line_distance=0.25, line_sigmas=0.0)
+    fits = [extracted(corner(30), wide, give_back_point=rule) for rule in (True, False)]
+    errors = [np.abs(np.asarray(found.lines.angle[0])) for found in fits]
+    lengths = [len(beams(found, 0)) for found in fits]
+    assert lengths[0] == lengths[1] - 1
+    assert errors[0] < errors[1]
+
+
+@pytest.mark.parametrize("sigmas", [0.0, 5.0])
+def test_criterion_2_widens_with_the_noise(sigmas: float) -> None:
+    # One point 6 cm off: outside the fixed gate of 3 cm, inside 5 sigma of 2 cm.
+    ranges = WALL.copy()
+    ranges[20] += 0.06
+    found = extracted(ranges, Thresholds(line_sigmas=sigmas))
+    assert (counts(found).get("distance", 0) > 0) == (sigmas == 0)
+
+
+@pytest.mark.parametrize(("missing", "broken"), [(1, 0), (2, 1)])
+@pytest.mark.parametrize("where", [15, 20])
+def test_criterion_3_counts_beams(missing: int, broken: int, where: int) -> None:
+    ranges = WALL.copy()
+    ranges[where : where + missing] = np.nan
+    found = extracted(ranges)
+    assert counts(found) == {"invalid": missing} | ({"bearing": 1} if broken else {})
+    assert len(beams(found, 0)) == (where if broken else N - missing)
+
+
+def test_a_gap_that_breaks_by_two_criteria_counts_as_distance() -> None:
+    ranges = np.where(np.arange(N) < 20, WALL, 1.5 * WALL)
+    ranges[18:22] = np.nan
+    assert counts(extracted(ranges, Thresholds(gap_spacings=0.0))) == {"gap": 1, "invalid": 4}
+
+
+@pytest.mark.parametrize(("n", "is_line"), [(1, False), (2, False), (3, True)])
+def test_three_points_make_a_line(n: int, is_line: bool) -> None:
+    ranges = np.full(N, np.nan)
+    ranges[18 : 18 + n] = WALL[18 : 18 + n]
+    found = extracted(ranges, Thresholds(min_length=0.05))
+    assert bool(found.lines.valid[0]) == is_line
+    assert counts(found).get("too_few", 0) == (0 if is_line else n)
+    assert counts(found).get("lone", 0) == (1 if n == 1 else 0)
+
+
+@pytest.mark.parametrize(("length", "is_line"), [(0.29, False), (0.31, True)])
+def test_lines_shorter_than_30_cm_are_not_modelled(length: float, is_line: bool) -> None:
+    low = np.arctan(length / 2 / 2)
+    bearings = np.linspace(-low, low, N)
+    scan = Scan.from_ranges(2 / np.cos(bearings), bearings)
+    found = extract(scan, HERE, capacity=CAPACITY, thresholds=Thresholds(), rules=Rules())
+    assert bool(found.lines.valid[0]) == is_line
+    assert counts(found).get("too_short", 0) == (0 if is_line else N)
+    if is_line:
+        np.testing.assert_allclose(found.lines.length[0], length, atol=1e-9)
+    else:
+        assert found.circles.valid.any() == (np.asarray(found.circle_of_beam) >= 0).any()
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.7, np.pi / 2, 2.2])
+def test_the_30_cm_rule_does_not_depend_on_the_direction(angle: float) -> None:
+    pose = Pose(mean=jnp.array([0.0, 0.0, angle]), cov=jnp.zeros((3, 3)))
+    for length in (0.299, 0.301):
+        low = np.arctan(length / 2 / 2)
+        bearings = np.linspace(-low, low, N)
+        scan = Scan.from_ranges(2 / np.cos(bearings), bearings)
+        found = extract(scan, pose, capacity=CAPACITY, thresholds=Thresholds(), rules=Rules())
+        assert bool(found.lines.valid[0]) == (length > 0.3)
+
+
+def test_the_readings_differ_where_they_should() -> None:
+    # One beam missing breaks a line by the paper's 1.5 spacings, not by 2.5.
+    ranges = WALL.copy()
+    ranges[20] = np.nan
+    scan = Scan.from_ranges(ranges, BEARINGS)
+    both: dict[str, Any] = {
+        name: extract(scan, HERE, capacity=CAPACITY, **preset(name)) for name in ("default", "paper")
+    }
+    assert (both["default"].lines.valid.sum(), both["paper"].lines.valid.sum()) == (1, 2)
+    assert (counts(both["default"]), counts(both["paper"])) == ({"invalid": 1}, {"invalid": 1, "bearing": 1})
+
+    # A step of 40 cm passes the paper's gap of 50 cm; there criterion 2 has to break the line.
+    ranges = np.where(np.arange(N) < 20, WALL, 1.2 * WALL)
+    scan = Scan.from_ranges(ranges, BEARINGS)
+    both = {name: extract(scan, HERE, capacity=CAPACITY, **preset(name)) for name in ("default", "paper")}
+    assert (counts(both["default"]), counts(both["paper"])) == ({"gap": 1}, {"distance": 1})

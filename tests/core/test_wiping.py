@@ -1,0 +1,267 @@
+"""Wiping: what is left of a line, by intervals, by triangles and by beams."""
+
+import dataclasses
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from linemap_jax import Capacity, LineMap, Rules, Thresholds, empty_map, update
+from linemap_jax.core.sensor import points_from_scan
+from linemap_jax.core.settings import Mount, SensorNoise
+from linemap_jax.core.state import Circles, Lines, Pose, Scan, empty_circles, empty_lines
+from linemap_jax.core.wiping import (
+    Triangles,
+    circles_inside_triangles,
+    inside_triangles,
+    passed_circles,
+    passed_through,
+    remaining,
+    swath_of_scan,
+    wipe_lines,
+)
+
+remaining_jit = jax.jit(remaining)
+NUMBER = st.integers(-40, 40).map(lambda i: i / 8)
+
+
+def subtract(extent: tuple[float, float], holes: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """One hole after the other out of a list of intervals."""
+    left = [extent]
+    for low, high in holes:
+        cut = []
+        for a, b in left:
+            if high <= a or low >= b:
+                cut.append((a, b))
+            else:
+                cut += [part for part in ((a, low), (high, b)) if part[1] > part[0]]
+        left = cut
+    return left
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    st.tuples(NUMBER, st.integers(0, 60)),
+    st.lists(st.tuples(NUMBER, st.integers(1, 30), st.booleans()), min_size=6, max_size=6),
+)
+def test_remaining_is_interval_subtraction(extent: tuple[float, int], holes: list[tuple[float, int, bool]]) -> None:
+    begin, length = extent
+    end = begin + length / 8
+    low = np.array([hole[0] for hole in holes])
+    high = low + np.array([hole[1] / 8 for hole in holes])
+    counts = np.array([hole[2] for hole in holes])
+    gone = (jnp.asarray(low), jnp.asarray(high), jnp.asarray(counts))
+    begins, ends, keep = (np.asarray(x) for x in remaining_jit(jnp.array([begin, end]), gone, 0.3))
+    found = [(a, b) for a, b, k in zip(begins, ends, keep, strict=True) if k]
+    expected = subtract((begin, end), [(a, b) for a, b, c in zip(low, high, counts, strict=True) if c])
+    # Holes that touch leave no fragment; eighths of a metre are exact, and none is 0.3
+    assert found == [(a, b) for a, b in sorted(expected) if b - a >= 0.3]
+    assert np.all(ends >= begins)
+
+
+def lines_of(*segments: Any, capacity: int = 6) -> Lines:
+    """Lines between pairs of points."""
+    lines = empty_lines(capacity)
+    for i, (begin, end) in enumerate(segments):
+        begin, end = np.asarray(begin, float), np.asarray(end, float)
+        tangent = (end - begin) / np.linalg.norm(end - begin)
+        half = np.linalg.norm(end - begin) / 2
+        lines = dataclasses.replace(
+            lines,
+            anchor=lines.anchor.at[i].set((begin + end) / 2),
+            angle=lines.angle.at[i].set(np.arctan2(tangent[1], tangent[0]) - np.pi / 2),
+            cov=lines.cov.at[i].set(jnp.diag(jnp.array([1e-5, 1e-5]))),
+            extent=lines.extent.at[i].set(jnp.array([-half, half])),
+            var_extent=lines.var_extent.at[i].set(1e-4),
+            times_detected=lines.times_detected.at[i].set(1),
+            valid=lines.valid.at[i].set(True),
+        )
+    return lines
+
+
+def segments_of(lines: Lines) -> list[tuple[np.ndarray, np.ndarray]]:
+    return [(np.asarray(lines.begin[i]), np.asarray(lines.end[i])) for i in np.flatnonzero(lines.valid)]
+
+
+CORNERS = np.array([[0.5, -1.0], [3.0, -2.5], [3.5, 2.0]])
+"""A triangle in the world: the scanner at (0.5, -1), and the base seen from it, counter-clockwise."""
+
+
+@jax.jit
+def wipe_by(lines: Lines, corners: jax.Array) -> Any:
+    robot = jnp.array([0.3, -1.1])
+    apex = corners[0] - robot
+    triangles = Triangles(
+        first=(corners[1] - corners[0])[None],
+        second=(corners[2] - corners[0])[None],
+        own=jnp.array([5]),
+        valid=jnp.ones(1, bool),
+        apex=apex,
+        robot=robot,
+    )
+    stretches = partial(inside_triangles, triangles=triangles)
+    affected = jax.vmap(lambda line, slot: jnp.any(stretches(line, slot)[2]))(lines, jnp.arange(lines.valid.shape[0]))
+    return wipe_lines(lines, affected, stretches, Thresholds())
+
+
+@pytest.mark.parametrize(
+    ("segment", "counts"),
+    [
+        (([1.5, -1.2], [2.2, -0.6]), (0, 0, 1)),  # inside: deleted
+        (([2.5, -0.5], [4.5, -0.4]), (1, 0, 0)),  # one end inside: shortened
+        (([2.0, -4.0], [2.2, 3.0]), (0, 1, 0)),  # through two sides: divided
+        (([4.5, -1.0], [4.6, 1.0]), (0, 0, 0)),  # outside: kept
+        (([4.5, -0.4], [2.5, -0.5]), (1, 0, 0)),  # the other end inside
+        (([2.9, -1.0], [3.3, -0.95]), (0, 0, 1)),  # a rest of less than 30 cm goes with it
+    ],
+)
+def test_cases_of_section_6_3_against_shapely(segment: Any, counts: tuple[int, int, int]) -> None:
+    before = lines_of(segment)
+    lines, wiped = wipe_by(before, jnp.asarray(CORNERS))
+    assert (int(wiped.trimmed), int(wiped.split), int(wiped.deleted)) == counts
+    assert not wiped.overflow
+    rest = shapely.LineString(segment).difference(shapely.Polygon(CORNERS))
+    parts = [part for part in getattr(rest, "geoms", [rest]) if part.length >= 0.3]
+    found = segments_of(lines)
+    assert len(found) == len(parts)
+    for part, (begin, end) in zip(
+        sorted(parts, key=lambda p: p.project(shapely.Point(segment[0]))), found, strict=True
+    ):
+        expected = np.array(part.coords)
+        np.testing.assert_allclose([begin, end], expected, atol=1e-9)
+    for i in np.flatnonzero(lines.valid) if sum(counts) else []:
+        np.testing.assert_allclose(lines.extent[i].sum(), 0, atol=1e-9)  # anchored at its own middle
+
+
+def test_random_lines_and_triangles_against_shapely() -> None:
+    random = np.random.default_rng(0)
+    touched = 0
+    for _ in range(60):
+        corners, segment = random.uniform(-3, 3, (3, 2)), random.uniform(-3, 3, (2, 2))
+        (x, y), (u, v) = corners[1] - corners[0], corners[2] - corners[0]
+        corners = corners if x * v - y * u > 0 else corners[[0, 2, 1]]
+        lines, wiped = wipe_by(lines_of(segment), jnp.asarray(corners))
+        rest = shapely.LineString(segment).difference(shapely.Polygon(corners))
+        parts = [part.length for part in getattr(rest, "geoms", [rest])]
+        if any(abs(length - 0.3) < 1e-6 for length in parts):
+            continue
+        cut = int(wiped.trimmed + wiped.split + wiped.deleted)
+        touched += cut
+        expected = sorted(length for length in parts if length >= 0.3 or not cut)
+        np.testing.assert_allclose(sorted(np.asarray(lines.length)[np.asarray(lines.valid)]), expected, atol=1e-9)
+    assert touched > 10
+
+
+def test_a_split_without_a_free_slot_says_so() -> None:
+    segment = ([2.0, -4.0], [2.2, 3.0])
+    full = lines_of(segment, *[([20.0 + i, 0.0], [20.0 + i, 1.0]) for i in range(5)])
+    lines, wiped = wipe_by(full, jnp.asarray(CORNERS))
+    assert wiped.overflow
+    assert int(lines.valid.sum()) == 6
+
+
+def circle_at(x: float, y: float, radius: float = 0.1) -> Circles:
+    return dataclasses.replace(
+        empty_circles(1), center=jnp.array([[x, y]]), radius=jnp.array([radius]), valid=jnp.ones(1, bool)
+    )
+
+
+@pytest.mark.parametrize(("x", "y", "inside"), [(2.0, -1.0, True), (4.0, 0.0, False), (0.4, -1.0, False), (3, 1, True)])
+def test_circles_inside_triangles(x: float, y: float, inside: bool) -> None:
+    assert shapely.Polygon(CORNERS).contains(shapely.Point(x, y)) == inside
+    first, second = CORNERS[1:] - CORNERS[0]
+    triangles = Triangles(
+        first=jnp.array([first]),
+        second=jnp.array([second]),
+        own=jnp.array([0]),
+        valid=jnp.ones(1, bool),
+        apex=jnp.zeros(2),
+        robot=jnp.asarray(CORNERS[0]),
+    )
+    assert bool(circles_inside_triangles(circle_at(x, y), triangles)[0]) == inside
+    nothing = dataclasses.replace(triangles, valid=jnp.zeros(1, bool))
+    assert not circles_inside_triangles(circle_at(x, y), nothing)[0]
+
+
+# By beams: a wall at 3 m across +-45 degrees, one beam a degree.
+BEARINGS = np.radians(np.arange(-45, 46))
+WALL = 3 / np.cos(BEARINGS)
+HERE = Pose(mean=jnp.zeros(3), cov=jnp.diag(jnp.array([0.01, 0.01, 0.002])) ** 2)
+SCAN_CAPACITY = Capacity(8, 8)
+
+
+def updated(lines: Lines, ranges: np.ndarray, circles: Circles | None = None) -> tuple[LineMap, Any]:
+    line_map = empty_map(Capacity(6, 1))
+    line_map = dataclasses.replace(line_map, lines=lines, circles=circles or line_map.circles)
+    return update(line_map, Scan.from_ranges(ranges, BEARINGS), HERE, capacity=SCAN_CAPACITY, rules=Rules())
+
+
+def test_a_line_before_a_seen_wall_vanishes() -> None:
+    after, report = updated(lines_of(([2.0, -0.8], [2.0, 0.8])), WALL)
+    assert (int(report.deleted), int(report.added)) == (1, 1)
+    ((begin, end),) = segments_of(after.lines)
+    np.testing.assert_allclose([begin, end], [[3, -3], [3, 3]], atol=1e-6)
+
+
+def test_a_line_behind_a_seen_wall_stays() -> None:
+    after, report = updated(lines_of(([4.0, -0.8], [4.0, 0.8])), WALL)
+    assert (int(report.deleted), int(report.trimmed), int(report.split)) == (0, 0, 0)
+    assert int(after.lines.valid.sum()) == 2
+
+
+def test_what_no_beam_passed_stays() -> None:
+    # The beams that would have passed it returned nothing.
+    after, report = updated(lines_of(([2.0, -0.8], [2.0, 0.8])), np.where(np.abs(BEARINGS) < 0.5, np.nan, WALL))
+    assert int(report.deleted) == 0
+    assert any(np.allclose(begin, [2.0, -0.8]) for begin, _ in segments_of(after.lines))
+
+
+def test_an_open_door_is_cut_out_of_a_line() -> None:
+    y = 3 * np.tan(BEARINGS)
+    ranges = np.where(np.abs(y) < 0.5, 2 * WALL, WALL)
+    after, report = updated(lines_of(([3.0, -3.0], [3.0, 3.0])), ranges)
+    assert (int(report.split), int(report.deleted)) == (1, 0)
+    pieces = sorted((sorted([begin[1], end[1]]) for begin, end in segments_of(after.lines) if abs(begin[0] - 3) < 0.05))
+    assert len(pieces) == 2
+    # The door's beams stand within one spacing of its posts.
+    np.testing.assert_allclose([pieces[0][1], pieces[1][0]], [-0.5, 0.5], atol=3 * np.radians(1.1))
+    np.testing.assert_allclose([pieces[0][0], pieces[1][1]], [-3, 3], atol=0.05)
+
+
+def test_short_fragments_go_too() -> None:
+    # The object's lower 20 cm were out of sight behind nothing at all: no beam there.
+    ranges = np.where(BEARINGS < np.arctan(-0.6 / 2), np.nan, WALL)
+    after, report = updated(lines_of(([2.0, -0.8], [2.0, 0.8])), ranges)
+    assert int(report.deleted) == 1
+    assert all(begin[0] > 2.9 for begin, _ in segments_of(after.lines))
+    ranges = np.where(BEARINGS < np.arctan(-0.4 / 2), np.nan, WALL)
+    after, report = updated(lines_of(([2.0, -0.8], [2.0, 0.8])), ranges)
+    assert (int(report.deleted), int(report.trimmed)) == (0, 1)
+
+
+@pytest.mark.parametrize(("own", "gone"), [(0, False), (1, True), (-1, True)])
+def test_beams_never_wipe_the_line_that_they_measure(own: int, gone: bool) -> None:
+    found = lines_of(([3.0, -3.0], [3.0, 3.0]), capacity=1)
+    points = points_from_scan(Scan.from_ranges(WALL, BEARINGS), HERE, Mount(), jacobians="analytic")
+    swath = swath_of_scan(points, HERE, jnp.zeros(91, jnp.int32), found, jnp.array([own]), jnp.array([1]), Thresholds())
+    line = jax.tree.map(lambda x: x[0], lines_of(([2.8, -1.0], [2.8, 1.0])))
+    _, _, which = passed_through(line, jnp.array(0), swath, HERE.cov, Thresholds(), SensorNoise())
+    assert bool(which.any()) == gone
+
+
+@pytest.mark.parametrize(
+    ("x", "radius", "gone"),
+    [(2.0, 0.1, True), (2.95, 0.1, False), (4.0, 0.1, False), (2.0, 0.005, False)],
+)
+def test_circles_that_beams_passed(x: float, radius: float, gone: bool) -> None:
+    found = lines_of(([3.0, -3.0], [3.0, 3.0]), capacity=1)
+    points = points_from_scan(Scan.from_ranges(WALL, BEARINGS), HERE, Mount(), jacobians="analytic")
+    swath = swath_of_scan(points, HERE, jnp.zeros(91, jnp.int32), found, jnp.array([0]), jnp.array([1]), Thresholds())
+    circles = circle_at(x, 0.2, radius)
+    assert bool(passed_circles(circles, swath, HERE.cov, Thresholds(), SensorNoise())[0]) == gone
