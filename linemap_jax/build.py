@@ -106,7 +106,7 @@ def build_chunks(
         if line_map is None:
             line_map = empty_map(map_capacity, scans.ranges.dtype)
         # Fill up with scans that hold nothing, which change nothing.
-        active = jnp.arange(chunk) < count
+        active = jnp.asarray(np.arange(chunk) < count)
         scans, poses = pad_stack(scans, chunk), pad_stack(poses, chunk)
         while True:
             after, report = _run(line_map, scans, poses, active, capacity=capacity, **options)
@@ -189,17 +189,18 @@ def join_reports(reports: list[Report]) -> Report:
     fill = {"line_slot": LEFT_OUT, "circle_slot": LEFT_OUT}
 
     def join(name: str) -> Array:
-        arrays = [getattr(report, name) for report in reports]
-        if arrays[0].ndim == 1:
-            return jnp.concatenate(arrays)
-        width = max(a.shape[1] for a in arrays)
-        padded = [jnp.pad(a, ((0, 0), (0, width - a.shape[1])), constant_values=fill.get(name, 0)) for a in arrays]
-        return jnp.concatenate(padded)
+        arrays = [np.asarray(getattr(report, name)) for report in reports]
+        if arrays[0].ndim > 1:
+            width = max(a.shape[1] for a in arrays)
+            value = fill.get(name, 0)
+            arrays = [np.pad(a, ((0, 0), (0, width - a.shape[1])), constant_values=value) for a in arrays]
+        return jnp.asarray(np.concatenate(arrays))
 
     return Report(**{field.name: join(field.name) for field in dataclasses.fields(Report)})
 
 
 def _slice(tree: Any, begin: int, end: int) -> Any:
+    """Items of a stack. On the host, where nothing has to be compiled."""
     if all(begin == 0 and end == x.shape[0] for x in jax.tree.leaves(tree)):
         return tree
-    return jax.tree.map(lambda x: x[begin:end], tree)
+    return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[begin:end]), tree)

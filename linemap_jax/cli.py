@@ -166,7 +166,7 @@ def _build(command: Build) -> int:
     with _progress(command, log):
         line_map, report, positions, seconds, interrupted = _map_of_log(command, log, options)
     _warn(command, log)
-    lost = int(((report.status & Status.POSE_NOT_FINITE) != 0).sum())
+    lost = sum(bool(status & Status.POSE_NOT_FINITE) for status in report.status.tolist())
     if lost:
         _say(command, f"warning: {log.path}: {lost} scans were left out: their poses are not finite in {command.dtype}")
 
@@ -194,6 +194,8 @@ def _map_of_log(
 
     And whether somebody interrupted it: then the map is the one so far.
     """
+    import numpy as np
+
     from linemap_jax.build import CHUNK, build_chunks, join_reports
     from linemap_jax.core.settings import Capacity
 
@@ -202,7 +204,7 @@ def _map_of_log(
 
     def driven() -> Iterator[Any]:
         for chunk in _chunks(command, log, CHUNK):
-            positions.extend(map(tuple, chunk.poses.mean[:, :2].tolist()))
+            positions.extend(map(tuple, np.asarray(chunk.poses.mean)[:, :2].tolist()))
             yield chunk.scans, chunk.poses
 
     line_map, interrupted = None, False
@@ -241,15 +243,15 @@ def _summary(
         "log": str(command.log),
         "preset": command.preset,
         "scans": scans,
-        "lines": int(lines.valid.sum()),
-        "circles": int(line_map.circles.valid.sum()),
+        "lines": int(np.asarray(lines.valid).sum()),
+        "circles": int(np.asarray(line_map.circles.valid).sum()),
         "explained": share,
         "median_line_length_m": float(np.median(length)) if length.size else 0.0,
         "duplicates": int(duplicates(lines).sum()),
         # The first chunk holds the compilation: a log of one chunk does not tell.
         "us_per_scan": 1e6 * float(np.median(seconds[1:])) / CHUNK if len(seconds) > 1 else None,
         "seconds_to_first_chunk": seconds[0],
-        "counts": {name: int(getattr(report, name).sum()) for name in COUNTS},
+        "counts": {name: int(np.asarray(getattr(report, name)).sum()) for name in COUNTS},
     }
 
 

@@ -271,12 +271,16 @@ def _filled(shape: tuple[int, ...], value: float, dtype: Any) -> Array:
 
 
 def pad_stack(stacked: Any, size: int) -> Any:
-    """Stacked items filled up to `size` by repeating the last one; whoever uses them knows how many count."""
-    if all(x.shape[0] == size for x in jax.tree.leaves(stacked)):
-        return stacked
-    return jax.tree.map(
-        lambda x: jnp.concatenate([x, jnp.broadcast_to(x[-1:], (size - x.shape[0], *x.shape[1:]))]), stacked
-    )
+    """Stacked items filled up to `size` by repeating the last one; whoever uses them knows how many count.
+
+    On the host, where nothing has to be compiled.
+    """
+
+    def fill(x: Array) -> Array:
+        missing = size - x.shape[0]
+        return jnp.asarray(np.concatenate([np.asarray(x), np.repeat(np.asarray(x)[-1:], missing, 0)])) if missing else x
+
+    return jax.tree.map(fill, stacked)
 
 
 def _as_float(x: ArrayLike | list | tuple) -> Array:

@@ -62,7 +62,7 @@ def chunks_of_readings(
             ),
             poses=Pose(
                 mean=jnp.asarray(mean),
-                cov=jnp.broadcast_to(jnp.asarray(cov_pose, dtype), (len(batch), 3, 3)),
+                cov=jnp.asarray(np.tile(np.asarray(cov_pose, dtype), (len(batch), 1, 1))),
             ),
             timestamps=np.array([reading.timestamp for reading in batch]),
         )

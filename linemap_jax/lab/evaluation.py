@@ -76,9 +76,9 @@ def explained_share(
     line_map = LineMap(lines=_crowded(line_map.lines), circles=_crowded(line_map.circles))
     hits = total = 0
     for scans, poses in chunks:
-        active = jnp.arange(chunk) < scans.ranges.shape[0]
+        active = np.arange(chunk) < scans.ranges.shape[0]
         scans, poses = pad_stack(scans, chunk), pad_stack(poses, chunk)
-        scans = dataclasses.replace(scans, valid=scans.valid & active[:, None])
+        scans = dataclasses.replace(scans, valid=jnp.asarray(np.asarray(scans.valid) & active[:, None]))
         h, t = explained(line_map, scans, poses, mount, **options)
         hits, total = hits + int(h), total + int(t)
     return hits / total if total else 0.0
