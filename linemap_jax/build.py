@@ -57,7 +57,7 @@ def build(
       The map, and the reports of all scans, stacked `[T]`.
 
     Raises:
-      ValueError: if scans and poses differ in number, or for what `update` refuses.
+      ValueError: if there is no scan, if scans and poses differ in number, or for what `update` refuses.
     """
     count = scans.ranges.shape[0]
     if poses.mean.shape[0] != count:

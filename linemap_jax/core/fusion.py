@@ -43,7 +43,8 @@ def fuse_lines(
       model: for each piece the line that it belongs to. A line that is new is the piece that leads its group: the point
         to linearise at.
       has_prior: false for new lines, whose covariance counts for nothing.
-      pieces: what was observed.
+      pieces: what was observed. Pieces of one line are taken to move with the pose as one line does: their Jacobians
+        agree once they are moved to one anchor.
       together: which pieces belong to one line; such pieces have the same `model`, and get the same result.
       cov_pose: covariance of the pose that the pieces share.
       thresholds: `end_sigmas`.
