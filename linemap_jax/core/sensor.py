@@ -41,7 +41,7 @@ class Points:
 def point_from_measurement(
     pose: Float[Array, "3"], measurement: Float[Array, "2"], mount: Float[Array, "3"]
 ) -> Float[Array, "2"]:
-    """F of Eq. (3): a measured point in the world.
+    """The function f of Eq. (3): a measured point in the world.
 
     Eq. (2), with the turn of the scanner on the robot added to the bearing (the paper's scanner looks ahead).
 

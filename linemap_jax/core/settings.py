@@ -64,7 +64,8 @@ class Thresholds:
     end_sigmas: Number = 3.0
     """End points that agree within this multiple of their spread are averaged; needs `Rules.estimate_ends`."""
     wipe_extension: Number = 0.05
-    """How far wiping reaches behind a line that was seen, m (s6.2). `paper`: 0.1."""
+    """How far wiping reaches behind a line that was seen, m (s6.2); by beams, only to what was seen no more often.
+    `paper`: 0.1."""
     wipe_sigmas: Number = 3.0
     """A beam has passed through a line or circle if it ends beyond it by this multiple of the predicted spread; needs
     `Rules.wipe_by_beams`."""
