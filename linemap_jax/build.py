@@ -22,7 +22,7 @@ from linemap_jax.core.state import LEFT_OUT, Extraction, LineMap, Pose, Report, 
 
 _jit = partial(
     jax.jit,
-    static_argnames=("capacity", "rules", "segmentation", "covariance", "jacobians"),
+    static_argnames=("pose_error", "capacity", "rules", "segmentation", "covariance", "jacobians"),
     # XLA's older loop emitters compile the many small kernels of a map step in half the time, and on a CPU they run
     # nearly twice as fast (jax 0.8.3). Other devices do not look at this option.
     compiler_options={"xla_cpu_use_fusion_emitters": False},

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from linemap_jax.core.frames import dot, perp
-from linemap_jax.core.propagation import apply, inverse, propagate
+from linemap_jax.core.propagation import apply, inverse, product, propagate, square_root
 from linemap_jax.core.runs import Runs
 from linemap_jax.core.sensor import Points
 from linemap_jax.core.settings import SensorNoise, Thresholds
@@ -105,10 +105,10 @@ def measure_circles(
     center = jnp.stack([whole.x0, whole.y0], -1) + centroid
 
     k = n.shape[0]
-    cov = jnp.zeros((k, 3, 3), radius.dtype)
+    cov = sqrt_persistent = jnp.zeros((k, 3, 3), radius.dtype)
     fitted = jnp.zeros(k, bool)
     if fit:
-        shift, fit_radius, cov_fit, fitted = _fit_circles(points, clusters, n, center, thresholds, noise)
+        shift, fit_radius, cov, fitted = _fit_circles(points, clusters, n, center, thresholds, noise)
         center = center + jnp.where(fitted[:, None], shift, 0)
         radius = jnp.where(fitted, fit_radius, radius)
         # The centre moves with the pose as every point does; the radius does not.
@@ -116,11 +116,13 @@ def measure_circles(
         turn = perp(center)
         rows = [[one, zero, turn[:, 0]], [zero, one, turn[:, 1]], [zero, zero, zero]]
         jac_circle_pose = jnp.stack([jnp.stack(row, -1) for row in rows], -2)
-        cov = jnp.where(fitted[:, None, None], cov_fit + propagate(jac_circle_pose, pose.cov), 0)
+        by_pose = product(jac_circle_pose, square_root(pose.cov)[None])
+        sqrt_persistent = jnp.where(fitted[:, None, None], by_pose, 0)
     circles = Circles(
         center=pose.mean[None, :2] + center,
         radius=radius,
-        cov=cov,
+        cov_independent=cov,
+        sqrt_persistent=sqrt_persistent,
         fitted=fitted,
         times_detected=jnp.ones_like(clusters.last),
         valid=clusters.valid,

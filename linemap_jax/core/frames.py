@@ -55,6 +55,7 @@ def reanchor(lines: Lines, anchor: Float[Array, "*s 2"]) -> Lines:
         lines,
         anchor=anchor,
         offset=lines.offset + dot(lines.normal, step),
-        cov=shift @ lines.cov @ jnp.swapaxes(shift, -1, -2),
+        cov_independent=shift @ lines.cov_independent @ jnp.swapaxes(shift, -1, -2),
+        sqrt_persistent=shift @ lines.sqrt_persistent,
         extent=lines.extent + along[..., None],
     )

@@ -1,41 +1,122 @@
 """Sections 5.1.2 and 5.2.2: a better estimate from two matching primitives, Eqs. (23)-(25).
 
-Eq. (23) as printed, K = C_l (C_l + C_m)^-1 and so on, loses positive definiteness in float32. The same estimate is
-formed from information matrices, at the anchor of the map's line. Pieces of one line in one scan share the pose: their
+Eq. (23) as printed, C_r = C_l - K C_l, loses positive definiteness in float32, and it takes scans for independent. Here
+the covariance is a sum of squares (Joseph's form), at the anchor of the map's line, and what a persisting pose error
+contributes goes through the fusion apart from the rest. Pieces of one line in one scan share the pose: their
 measurement parts are combined first, and the pose error is added once.
 """
 
 import dataclasses
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from linemap_jax.core.frames import dot, shift_matrix, wrap_angle
 from linemap_jax.core.matching import CircleMatches, compare_lines, with_sign
-from linemap_jax.core.propagation import apply, inverse, product, propagate, symmetric
-from linemap_jax.core.settings import Rules, Thresholds
-from linemap_jax.core.slots import least
-from linemap_jax.core.state import Circles, Lines, pytree
+from linemap_jax.core.propagation import apply, inverse, product, propagate, square_root, symmetric
+from linemap_jax.core.settings import Number, PoseError, Rules, Thresholds
+from linemap_jax.core.slots import choose, least, take
+from linemap_jax.core.state import Circles, Lines, pytree, squared
 
 
 @pytree
-class Pieces:
-    """Observed pieces of lines."""
+class Errors:
+    """The error of an estimate of n numbers, in the two parts of `Lines` and `Circles`."""
 
-    lines: Lines
-    cov_measurement: Float[Array, "L 2 2"]  # of (offset, angle), not shared with other pieces
-    jac_line_pose: Float[Array, "L 2 3"]  # what they share
+    cov_independent: Float[Array, "*s n n"]
+    sqrt_persistent: Float[Array, "*s n 3"]
+    times_detected: Int[Array, "*s"]
+
+
+ErrorsT = TypeVar("ErrorsT", Errors, Lines, Circles)
+
+
+def combine(old: Errors, new: Errors, pose_error: PoseError) -> tuple[Float[Array, "*s n n"], Errors]:
+    """The gain K of x = x_old + K (x_new - x_old), and the error of x: Eq. (23) for both parts of the error.
+
+    Whatever the gain, the independent part is (I - K) C_old (I - K)^T + K C_new K^T, which no rounding makes
+    indefinite. With A_old and A_new for the square roots of what persists:
+
+    "independent" and "persistent": both errors hold the same u (if there is any), and their parts add up as
+    (I - K) A_old + K A_new. With D = A_new - A_old the best gain is
+    K = (C_old - A_old D^T) (C_old + C_new + D D^T)^-1, that of a Schmidt-Kalman filter, which considers u but does not
+    estimate it. Where nothing persists, that is Eq. (23).
+
+    "unknown": any correlation is possible. For each w in (0, 1) the persisting part is bounded by
+    (I - K) A_old A_old^T (I - K)^T / w + K A_new A_new^T K^T / (1 - w), split covariance intersection (Julier and
+    Uhlmann 2001). The gain is the best one for w = n_old / (n_old + n_new), so that views that are equally good are
+    averaged; then w is the one that makes the bound least for this gain.
+
+    Args:
+      old: of the map's primitive.
+      new: of what was observed.
+      pose_error: the model of the pose error.
+
+    Returns:
+      K, shape `[*s, n, n]`, and the error of the result; its times are those of both.
+    """
+    c_old, a_old = old.cov_independent, old.sqrt_persistent
+    c_new, a_new = new.cov_independent, new.sqrt_persistent
+    times = old.times_detected + new.times_detected
+    if pose_error == "unknown":
+        w = (old.times_detected / times).astype(c_old.dtype)[..., None, None]
+        before = c_old + squared(a_old) / w
+        innovation = before + c_new + squared(a_new) / (1 - w)
+    else:
+        difference = a_new - a_old
+        before = c_old - product(a_old, jnp.swapaxes(difference, -1, -2))
+        innovation = c_old + c_new + squared(difference)
+    unit = inverse(symmetric(innovation))
+    gain = product(before, unit)
+    keep = jnp.eye(gain.shape[-1], dtype=gain.dtype) - gain
+    independent = propagate(keep, c_old) + propagate(gain, c_new)
+    a_old, a_new = product(keep, a_old), product(gain, a_new)
+    if pose_error == "unknown":
+        # 1 / w = 1 + b / a and 1 / (1 - w) = 1 + a / b, with a and b the sizes of both terms
+        a, b = (_size(squared(x), unit) for x in (a_old, a_new))
+        some = (a > 0) & (b > 0)
+        ratio = jnp.where(some, b / jnp.where(some, a, 1), 1)[..., None, None]
+        bound = squared(a_old) * (1 + ratio) + squared(a_new) * (1 + 1 / ratio)
+        bound = jnp.where(some[..., None, None], bound, squared(a_old) + squared(a_new))
+        root = square_root(bound)
+        persistent = jnp.zeros_like(a_old).at[..., : root.shape[-1]].set(root)
+    else:
+        persistent = a_old + a_new
+    return gain, Errors(cov_independent=independent, sqrt_persistent=persistent, times_detected=times)
+
+
+def forget(primitives: ErrorsT, share: Number) -> ErrorsT:
+    """Lines or circles of whose persisting variance only a share persists; the rest counts as independent.
+
+    The whole covariance does not change. For what one scan has seen this brings in the share of the pose error that
+    persists. For a map one scan later: of u[k] = a u[k+1] + sqrt(1 - a^2) w only a share of a^2 is still there.
+    """
+    return dataclasses.replace(
+        primitives,
+        cov_independent=primitives.cov_independent + (1 - share) * squared(primitives.sqrt_persistent),
+        sqrt_persistent=jnp.sqrt(share) * primitives.sqrt_persistent,
+    )
+
+
+def _size(cov: Float[Array, "*s n n"], unit: Float[Array, "*s n n"]) -> Float[Array, "*s"]:
+    """The square root of the trace of a covariance, measured by an information matrix."""
+    trace = jnp.sum(cov * unit, (-1, -2))
+    positive = trace > 0
+    # Twice, so that the gradient at zero is finite.
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, trace, 1)), 0)
 
 
 def fuse_lines(
     model: Lines,
     has_prior: Bool[Array, " L"],
-    pieces: Pieces,
+    pieces: Lines,
     together: Bool[Array, "L L"],
-    cov_pose: Float[Array, "3 3"],
     thresholds: Thresholds,
     rules: Rules,
+    pose_error: PoseError,
+    share: Number = 1.0,
 ) -> Lines:
     """Eq. (23) and the end points of section 5.1.2: each piece's line, improved by all pieces that are parts of it.
 
@@ -43,47 +124,48 @@ def fuse_lines(
       model: for each piece the line that it belongs to. A line that is new is the piece that leads its group: the point
         to linearise at.
       has_prior: false for new lines, whose covariance counts for nothing.
-      pieces: what was observed. Pieces of one line are taken to move with the pose as one line does: their Jacobians
-        agree once they are moved to one anchor.
+      pieces: what one scan observed. All of the pose error, which they share, stands in `sqrt_persistent`.
       together: which pieces belong to one line; such pieces have the same `model`, and get the same result.
-      cov_pose: covariance of the pose that the pieces share.
       thresholds: `end_sigmas`.
       rules: `estimate_ends`.
+      pose_error: its model.
+      share: of the pose error that persists; the rest counts as independent once the pieces have been combined.
 
     Returns:
       The improved lines, one for each piece. Rows of `together` that are empty give nonsense.
     """
     count = has_prior.shape[0]
 
-    def in_map(piece: Lines, line: Lines, cov: Array, jac: Array) -> Array:
+    def in_map(piece: Lines, line: Lines) -> Array:
         """Information of one piece about its line, at the line's anchor: matrix, what the pose adds, vector."""
-        pair = compare_lines(piece, line, thresholds)
+        pair = compare_lines(piece, line, thresholds, pose_error)
         shift = shift_matrix(pair.lever)
-        weight = product(shift.T, inverse(with_sign(cov, pair.sign)))
-        turned = jac * jnp.stack([pair.sign, jnp.ones_like(pair.sign)])[:, None]
+        weight = product(shift.T, inverse(with_sign(piece.cov_independent, pair.sign)))
+        turned = piece.sqrt_persistent * jnp.stack([pair.sign, jnp.ones_like(pair.sign)])[:, None]
         innovation = jnp.stack([pair.offset, pair.angle])
         return jnp.concatenate(
             [product(weight, shift), product(weight, turned), apply(weight, innovation)[:, None]], -1
         )
 
-    parts = jax.vmap(in_map)(pieces.lines, model, pieces.cov_measurement, pieces.jac_line_pose)
+    parts = jax.vmap(in_map)(pieces, model)
     member = together.astype(parts.dtype)
     total = jnp.dot(member, parts.reshape(count, -1), precision=jax.lax.Precision.HIGHEST).reshape(parts.shape)
-    information, by_pose, vector = total[..., :2], total[..., 2:5], total[..., 5]
+    cov_seen = symmetric(inverse(total[..., :2]))
+    by_pose = product(cov_seen, total[..., 2:5])
+    times = jnp.max(jnp.where(together, pieces.times_detected[None], 1), -1)
+    seen = forget(Errors(cov_independent=cov_seen, sqrt_persistent=by_pose, times_detected=times), share)
+    gain, errors = combine(_errors(model), seen, pose_error)
 
-    cov_measurement = inverse(information)
-    seen = apply(cov_measurement, vector)
-    cov_seen = cov_measurement + propagate(product(cov_measurement, by_pose), cov_pose)
-    information_seen = inverse(cov_seen)
-    prior = jnp.where(has_prior[:, None, None], inverse(model.cov), 0)
-    cov = symmetric(inverse(prior + information_seen))
-    change = apply(cov, apply(information_seen, seen))
+    first_seen = ~has_prior[:, None, None]
+    gain = jnp.where(first_seen, jnp.eye(2, dtype=gain.dtype)[None], gain)
+    change = apply(product(gain, cov_seen), total[..., 5])
     fused = dataclasses.replace(
         model,
         offset=model.offset + change[:, 0],
         angle=wrap_angle(model.angle + change[:, 1]),
-        cov=cov,
-        times_detected=jnp.where(has_prior, model.times_detected + 1, 1),
+        cov_independent=jnp.where(first_seen, seen.cov_independent, errors.cov_independent),
+        sqrt_persistent=jnp.where(first_seen, seen.sqrt_persistent, errors.sqrt_persistent),
+        times_detected=jnp.where(has_prior, errors.times_detected, times),
     )
     return _fuse_ends(fused, has_prior, pieces, together, thresholds, rules)
 
@@ -91,7 +173,7 @@ def fuse_lines(
 def _fuse_ends(
     model: Lines,
     has_prior: Bool[Array, " L"],
-    pieces: Pieces,
+    pieces: Lines,
     together: Bool[Array, "L L"],
     thresholds: Thresholds,
     rules: Rules,
@@ -103,14 +185,14 @@ def _fuse_ends(
     an observed end well beyond the old one replaces it, and one well short of it (the rest was hidden) does nothing.
     """
     tangent = model.tangent
-    along = jnp.stack([dot(tangent, end - model.anchor) for end in (pieces.lines.begin, pieces.lines.end)], -1)
+    along = jnp.stack([dot(tangent, end - model.anchor) for end in (pieces.begin, pieces.end)], -1)
 
     def outermost(direction: int, old: Array, var_old: Array) -> tuple[Array, Array]:
         """The lower end for direction -1, the upper one for +1, in coordinates in which larger is longer."""
         reach = direction * along
         second = reach[:, 1] > reach[:, 0]
         mine = jnp.where(second, reach[:, 1], reach[:, 0])
-        var_mine = jnp.where(second, pieces.lines.var_extent[:, 1], pieces.lines.var_extent[:, 0])
+        var_mine = jnp.where(second, pieces.var_extent[:, 1], pieces.var_extent[:, 0])
         piece, new = least(jnp.where(together, -mine[None], jnp.inf))
         new, var_new = -new, var_mine[piece]
         old = direction * old
@@ -130,7 +212,9 @@ def _fuse_ends(
     return dataclasses.replace(model, extent=extent, var_extent=var_extent)
 
 
-def fuse_circles(model: Circles, new: Circles, matches: CircleMatches, rules: Rules) -> Circles:
+def fuse_circles(
+    model: Circles, new: Circles, matches: CircleMatches, rules: Rules, pose_error: PoseError
+) -> Circles:
     """A better estimate of the map's circles from the new ones that match them: section 5.2.2.
 
     `weigh_circles` false: Eqs. (24)-(25), the mean of old and new; the print of (24) repeats y_cn where it means y_cm.
@@ -143,6 +227,7 @@ def fuse_circles(model: Circles, new: Circles, matches: CircleMatches, rules: Ru
       matches: which is which. Several new ones that match one of the map are averaged first (of fitted ones, the
         nearest is taken).
       rules: `weigh_circles`.
+      pose_error: its model.
     """
     k = model.valid.shape[0]
     into = jnp.where(matches.slot < 0, k, matches.slot)
@@ -152,11 +237,13 @@ def fuse_circles(model: Circles, new: Circles, matches: CircleMatches, rules: Ru
     as_vector = jnp.concatenate([new.center, new.radius[:, None]], -1)
     old = jnp.concatenate([model.center, model.radius[:, None]], -1)
     mean = jax.ops.segment_sum(as_vector, into, k) / n[:, None]
+    times = model.times_detected
+    errors = _errors(model)
 
     if not rules.weigh_circles:
-        fused, cov, fitted = (old + mean) / 2, model.cov, model.fitted
+        fused, fitted = (old + mean) / 2, model.fitted
     else:
-        weight = 1 / (model.times_detected + 1).astype(n.dtype)
+        weight = 1 / (times + 1).astype(n.dtype)
         running = old + weight[:, None] * (mean - old)
         # The nearest fitted one of those that match
         distance = jnp.where(new.fitted, matches.distance, jnp.inf)
@@ -166,27 +253,44 @@ def fuse_circles(model: Circles, new: Circles, matches: CircleMatches, rules: Ru
         index = jnp.where(chosen, jnp.arange(into.shape[0]), into.shape[0])
         which = jnp.minimum(jax.ops.segment_min(index, into, k), into.shape[0] - 1)
         has_fit = jnp.isfinite(nearest) & touched
-        seen, cov_seen = as_vector[which], new.cov[which]
-        both = has_fit & model.fitted
-        eye = jnp.eye(3, dtype=n.dtype)[None]
-        prior = inverse(jnp.where(both[:, None, None], model.cov, eye))
-        gain = inverse(jnp.where(both[:, None, None], cov_seen, eye))
-        cov_both = symmetric(inverse(prior + gain))
-        joint = old + apply(cov_both, apply(gain, seen - old))
+        fit = take(new, which)
+        seen = as_vector[which]
 
-        fused = jnp.where(
-            both[:, None],
-            joint,
-            jnp.where(has_fit[:, None], seen, jnp.where(model.fitted[:, None], old, running)),
-        )
-        cov = jnp.where(both[:, None, None], cov_both, jnp.where(has_fit[:, None, None], cov_seen, model.cov))
+        both = (has_fit & model.fitted)[:, None, None]
+        errors_seen = dataclasses.replace(_errors(fit), times_detected=jnp.ones_like(times))
+        gain, joint = combine(_or_neutral(errors, both), _or_neutral(errors_seen, both), pose_error)
+
+        fused = jnp.where(model.fitted[:, None], old, running)
+        fused = jnp.where(has_fit[:, None], seen, fused)
+        fused = jnp.where(both[..., 0], old + apply(gain, seen - old), fused)
+        errors = choose(both[:, 0, 0], joint, choose(has_fit, errors_seen, errors))
         fitted = model.fitted | has_fit
 
+    at = touched[:, None, None]
     return dataclasses.replace(
         model,
         center=jnp.where(touched[:, None], fused[:, :2], model.center),
         radius=jnp.where(touched, fused[:, 2], model.radius),
-        cov=jnp.where(touched[:, None, None], cov, model.cov),
+        cov_independent=jnp.where(at, errors.cov_independent, model.cov_independent),
+        sqrt_persistent=jnp.where(at, errors.sqrt_persistent, model.sqrt_persistent),
         fitted=jnp.where(touched, fitted, model.fitted),
-        times_detected=model.times_detected + touched.astype(jnp.int32),
+        times_detected=times + touched.astype(jnp.int32),
+    )
+
+
+def _errors(primitives: Lines | Circles) -> Errors:
+    return Errors(
+        cov_independent=primitives.cov_independent,
+        sqrt_persistent=primitives.sqrt_persistent,
+        times_detected=primitives.times_detected,
+    )
+
+
+def _or_neutral(errors: Errors, meant: Bool[Array, "K 1 1"]) -> Errors:
+    """The errors that are meant; elsewhere some that give no NaN."""
+    eye = jnp.eye(errors.cov_independent.shape[-1], dtype=errors.cov_independent.dtype)
+    return Errors(
+        cov_independent=jnp.where(meant, errors.cov_independent, eye),
+        sqrt_persistent=jnp.where(meant, errors.sqrt_persistent, 0),
+        times_detected=jnp.where(meant[:, 0, 0], errors.times_detected, 1),
     )

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from linemap_jax.core.frames import dot, perp, shift_matrix, wrap_angle
-from linemap_jax.core.propagation import product, propagate, quadratic, symmetric
+from linemap_jax.core.propagation import product, propagate, quadratic, square_root, symmetric
 from linemap_jax.core.runs import Runs
 from linemap_jax.core.segmentation.incremental import Run
 from linemap_jax.core.sensor import Points, cov_point
@@ -220,7 +220,8 @@ def measure_lines(
         anchor=anchor_world,
         offset=offset,
         angle=angle,
-        cov=cov_measurement + propagate(jac_line_pose, pose.cov),
+        cov_independent=cov_measurement,
+        sqrt_persistent=product(jac_line_pose, square_root(pose.cov)[None]),
         extent=extent,
         var_extent=_var_extent(points, pose, runs, angle, noise),
         times_detected=jnp.ones_like(runs.first),

@@ -22,10 +22,13 @@ from linemap_jax.core.settings import (
     Covariance,
     Jacobians,
     Mount,
+    Persistence,
+    PoseError,
     Rules,
     Segmentation,
     SensorNoise,
     Thresholds,
+    persistence_of,
 )
 from linemap_jax.core.slots import choose, first_true, free_slots, neutral_where_free, put, take
 from linemap_jax.core.state import (
@@ -49,7 +52,7 @@ def empty_map(capacity: Capacity = Capacity(), dtype: jnp.dtype | type | None = 
     return LineMap(lines=empty_lines(capacity.lines, dtype), circles=empty_circles(capacity.circles, dtype))
 
 
-@partial(jax.jit, static_argnames=("capacity", "rules", "segmentation", "covariance", "jacobians"))
+@partial(jax.jit, static_argnames=("pose_error", "capacity", "rules", "segmentation", "covariance", "jacobians"))
 def update(
     line_map: LineMap,
     scan: Scan,
@@ -58,6 +61,8 @@ def update(
     thresholds: Thresholds | None = None,
     noise: SensorNoise | None = None,
     mount: Mount | None = None,
+    pose_error: PoseError = "unknown",
+    persistence: Persistence | None = None,
     capacity: Capacity = SCAN_CAPACITY,
     rules: Rules = Rules(),
     segmentation: Segmentation = "incremental",
@@ -75,6 +80,10 @@ def update(
       thresholds: `Thresholds()` unless given.
       noise: of the sensor; `SensorNoise()` unless given.
       mount: of the scanner on the robot; at its centre, looking ahead, unless given.
+      pose_error: how the errors of the poses of several scans hang together. "independent", as Eq. (23) takes them;
+        "persistent", by the model that `persistence` gives; "unknown": the covariances of the map are bounds that hold
+        for every possible correlation.
+      persistence: for "persistent"; `Persistence()` unless given.
       capacity: slots for the lines and circles of the scan (those of the map are its own).
       rules: which reading of the method.
       segmentation: as for `extract`.
@@ -88,9 +97,10 @@ def update(
       ValueError: at trace time, for an option that does not exist or a map of another dtype than the scan.
     """
     dtype = scan.ranges.dtype
-    if line_map.lines.cov.dtype != dtype:
-        raise ValueError(f"the map is {line_map.lines.cov.dtype} and the scan {dtype}; make both the same")
+    if line_map.lines.offset.dtype != dtype:
+        raise ValueError(f"the map is {line_map.lines.offset.dtype} and the scan {dtype}; make both the same")
     thresholds, noise, mount = with_defaults(thresholds, noise, mount, dtype)
+    persistence = as_dtype(persistence_of(pose_error, persistence), dtype)
     pose = as_dtype(pose, dtype)
     scan, pose, finite = usable(scan, pose)
     points = points_from_scan(scan, pose, mount, jacobians=jacobians)
@@ -106,9 +116,17 @@ def update(
         jacobians=jacobians,
     )
 
-    lines = _update_lines(line_map.lines, found, pose, thresholds, rules)
+    if pose_error == "persistent":
+        # A scan without returns is none, so that a chunk may be filled up with such.
+        correlation = jnp.where(jnp.any(scan.valid), persistence.correlation, 1)
+        line_map = dataclasses.replace(
+            line_map,
+            lines=fusion.forget(line_map.lines, correlation**2),
+            circles=fusion.forget(line_map.circles, correlation**2),
+        )
+    lines = _update_lines(line_map.lines, found, thresholds, rules, pose_error, persistence.share)
     swept = _sweep(line_map.circles, lines, found, points, pose, thresholds, noise, rules)
-    circles = _update_circles(line_map.circles, found, swept.lines, lines.targets, swept.gone, thresholds, rules)
+    circles = _update_circles(line_map.circles, found, swept.lines, lines.targets, swept.gone, thresholds, rules, pose_error, persistence.share)
 
     status = found.status | jnp.where(finite, 0, int(Status.POSE_NOT_FINITE))
     status |= jnp.where(lines.overflow | swept.wiped.overflow, int(Status.MAP_LINES_FULL), 0)
@@ -146,17 +164,18 @@ class _LineUpdate(NamedTuple):
     overflow: Array
 
 
-def _update_lines(model: Lines, found: Extraction, pose: Pose, thresholds: Thresholds, rules: Rules) -> _LineUpdate:
+def _update_lines(
+    model: Lines, found: Extraction, thresholds: Thresholds, rules: Rules, pose_error: PoseError, share: Array
+) -> _LineUpdate:
     """Section 5.1: match, then fuse or add, then merge."""
     new = found.lines
-    if rules.share_pose:
-        cov_measurement, jac_line_pose = found.cov_measurement, found.jac_line_pose
-    else:
-        cov_measurement, jac_line_pose = new.cov, jnp.zeros_like(found.jac_line_pose)
+    if not rules.share_pose:
+        new = fusion.forget(new, jnp.zeros_like(share))
 
-    match = matching.match_lines(new, model, thresholds, rules)
+    pair = matching.compare_pieces(new, thresholds)
+    match = matching.match_lines(fusion.forget(new, share), model, pair.collinear, thresholds, rules, pose_error)
     unmatched = new.valid & (match.slot < 0) & (match.suspect < 0)
-    leader = matching.group_lines(new, cov_measurement, unmatched, thresholds)
+    leader = matching.group_lines(pair, unmatched, thresholds)
 
     has_prior = match.slot >= 0
     leads = leader == jnp.arange(leader.shape[0])
@@ -164,8 +183,7 @@ def _update_lines(model: Lines, found: Extraction, pose: Pose, thresholds: Thres
     targets = jnp.where(has_prior, match.slot, jnp.where(leader >= 0, slot_of_leader[leader], -1))
     mine = choose(has_prior, take(model, match.slot), take(new, leader))
     together = (targets[:, None] == targets[None]) & (targets >= 0)[None]
-    pieces = fusion.Pieces(lines=new, cov_measurement=cov_measurement, jac_line_pose=jac_line_pose)
-    fused = fusion.fuse_lines(mine, has_prior, pieces, together, pose.cov, thresholds, rules)
+    fused = fusion.fuse_lines(mine, has_prior, new, together, thresholds, rules, pose_error, share)
     # All pieces of a line have the same result; the first one writes it.
     first = (targets >= 0) & (jax.vmap(first_true)(together) == jnp.arange(targets.shape[0]))
     model = put(model, jnp.where(first, targets, -1), fused)
@@ -175,7 +193,9 @@ def _update_lines(model: Lines, found: Extraction, pose: Pose, thresholds: Thres
     suspect = match.suspect
     merged = jnp.zeros((), jnp.int32)
     if rules.merge:
-        model, moved, merged = _merge(model, fused, jnp.where(first, targets, -1), thresholds, rules)
+        seen_apart = _mark(~pair.collinear, targets, model.valid.shape[0])
+        touched = jnp.where(first, targets, -1)
+        model, moved, merged = _merge(model, fused, touched, seen_apart, thresholds, rules, pose_error)
         targets = jnp.where(targets >= 0, moved[targets], targets)
         slot, suspect = (jnp.where(x >= 0, moved[x], x) for x in (slot, suspect))
     return _LineUpdate(
@@ -192,8 +212,20 @@ def _update_lines(model: Lines, found: Extraction, pose: Pose, thresholds: Thres
     )
 
 
+def _mark(which: Bool[Array, "L L"], slots: Int[Array, " L"], capacity: int) -> Bool[Array, "L K"]:
+    """The columns brought to the slots of the map that they stand for, -1 for none."""
+    into = jnp.where(slots < 0, capacity, slots)
+    return jnp.zeros((which.shape[0], capacity), bool).at[:, into].max(which, mode="drop")
+
+
 def _merge(
-    model: Lines, touched: Lines, slots: Int[Array, " L"], thresholds: Thresholds, rules: Rules
+    model: Lines,
+    touched: Lines,
+    slots: Int[Array, " L"],
+    seen_apart: Bool[Array, "L K"],
+    thresholds: Thresholds,
+    rules: Rules,
+    pose_error: PoseError,
 ) -> tuple[Lines, Int[Array, " K"], Int[Array, ""]]:
     """Join lines of the map that overlap and agree, where this scan touched one of them.
 
@@ -203,16 +235,18 @@ def _merge(
       model: the lines of the map.
       touched: the lines that this scan touched, as they now are.
       slots: where they stand, -1 for those that are not meant.
+      seen_apart: the lines of the map that this scan has seen beside them.
       thresholds: `match_...`.
       rules: which reading of the method.
+      pose_error: its model.
 
     Returns:
       The lines; for each slot where its line now stands; how many were joined.
     """
     k = model.valid.shape[0]
     everywhere = jnp.arange(k, dtype=jnp.int32)
-    others = (slots >= 0)[:, None] & (everywhere[None] != slots[:, None])
-    partner, nis = matching.best_line(touched, model, thresholds, among=others, overlapping=True)
+    others = (slots >= 0)[:, None] & (everywhere[None] != slots[:, None]) & ~seen_apart
+    partner, nis = matching.best_line(touched, model, thresholds, pose_error, among=others, overlapping=True)
     some = nis < thresholds.match_nis
 
     pair = jnp.stack([slots, partner], -1)
@@ -224,13 +258,9 @@ def _merge(
     other = take(model, partner)
     swap = partner < slots
     stays, goes = choose(swap, other, touched), choose(swap, touched, other)
-    pieces = fusion.Pieces(
-        lines=goes, cov_measurement=goes.cov, jac_line_pose=jnp.zeros((*slots.shape, 2, 3), goes.cov.dtype)
-    )
     # Both are estimates of the whole wall: the one that reaches farther knows the end.
     longest = dataclasses.replace(rules, estimate_ends=False)
-    no_pose = jnp.zeros((3, 3), goes.cov.dtype)
-    joined = fusion.fuse_lines(stays, accepted, pieces, jnp.diag(accepted), no_pose, thresholds, longest)
+    joined = fusion.fuse_lines(stays, accepted, goes, jnp.diag(accepted), thresholds, longest, pose_error)
     joined = dataclasses.replace(joined, times_detected=jnp.maximum(stays.times_detected, goes.times_detected))
     low, high = jnp.min(pair, -1), jnp.max(pair, -1)
     model = put(model, jnp.where(accepted, low, -1), joined)
@@ -306,14 +336,16 @@ def _update_circles(
     gone: Bool[Array, " K"],
     thresholds: Thresholds,
     rules: Rules,
+    pose_error: PoseError,
+    share: Array,
 ) -> _CircleUpdate:
     """Section 5.2: match, then fuse or add; and none too close to a line."""
-    new = found.circles
-    match = matching.match_circles(new, model, thresholds, rules)
+    new = fusion.forget(found.circles, share)
+    match = matching.match_circles(new, model, thresholds, rules, pose_error)
     k = model.valid.shape[0]
     matched = jnp.zeros(k, bool).at[jnp.where(match.slot < 0, k, match.slot)].set(True, mode="drop")
     gone = gone & ~matched
-    model = fusion.fuse_circles(model, new, match, rules)
+    model = fusion.fuse_circles(model, new, match, rules, pose_error)
     model = dataclasses.replace(model, valid=model.valid & ~gone)
 
     fresh = new.valid & (match.slot < 0) & ~match.ambiguous & ~near_lines(new, lines, thresholds)

@@ -12,9 +12,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from linemap_jax.core.frames import dot, wrap_angle
 from linemap_jax.core.propagation import inverse, quadratic
-from linemap_jax.core.settings import Rules, Thresholds
+from linemap_jax.core.settings import PoseError, Rules, Thresholds
 from linemap_jax.core.slots import least, take
-from linemap_jax.core.state import Circles, Lines, pytree
+from linemap_jax.core.state import Circles, Lines, pytree, squared
 
 OVERLAP_WEIGHT = 1e-3
 """1/m: a metre more of overlap counts like this much less of the normalised distance. It decides between equals."""
@@ -30,10 +30,11 @@ class LineComparison:
     sign: Float[Array, ""]  # -1 where the new line has to be taken reversed
     nis: Float[Array, ""]  # Eq. (21)
     gap: Float[Array, ""]  # m, along the line; negative where the segments overlap
-    geometric: Bool[Array, ""]  # passes the angle gate, the end-point gate and the gap gate
+    collinear: Bool[Array, ""]  # passes the angle gate and the end-point gate
+    geometric: Bool[Array, ""]  # is collinear, and passes the gap gate
 
 
-def compare_lines(new: Lines, model: Lines, thresholds: Thresholds) -> LineComparison:
+def compare_lines(new: Lines, model: Lines, thresholds: Thresholds, pose_error: PoseError) -> LineComparison:
     """Hold one new line against one line of the map: section 5.1.1.
 
     The gates on angle and end points widen with the predicted spread of what they gate; the paper's are fixed.
@@ -42,6 +43,8 @@ def compare_lines(new: Lines, model: Lines, thresholds: Thresholds) -> LineCompa
       new: the new line, no batch axis.
       model: the line of the map, no batch axis.
       thresholds: `match_...`.
+      pose_error: its model. "persistent": what persists is one error in both lines, and cancels as far as it moves
+        both alike. Else the two are taken for independent, as Eq. (21) does.
     """
     turn = wrap_angle(new.angle - model.angle)
     reverse = jnp.abs(turn) > jnp.pi / 2
@@ -53,22 +56,32 @@ def compare_lines(new: Lines, model: Lines, thresholds: Thresholds) -> LineCompa
     normal, tangent = model.normal, model.tangent
     lever = dot(tangent, step)
     offset = sign * new.offset - (model.offset + dot(normal, step))
-    var_angle = new.cov[1, 1] + model.cov[1, 1]
-    # S C S^T of the map's line
-    covariance = sign * new.cov[0, 1] + model.cov[0, 1] + lever * model.cov[1, 1]
-    var_offset = new.cov[0, 0] + model.cov[0, 0] + lever * (2 * model.cov[0, 1] + lever * model.cov[1, 1])
+    # The innovation's covariance: that of (sign offset, angle) of the new line plus S C S^T of the map's.
+    c_new, c_model = new.cov_independent, model.cov_independent
+    var_angle = c_new[1, 1] + c_model[1, 1]
+    covariance = sign * c_new[0, 1] + c_model[0, 1] + lever * c_model[1, 1]
+    var_offset = c_new[0, 0] + c_model[0, 0] + lever * (2 * c_model[0, 1] + lever * c_model[1, 1])
+    a_new, a_model = new.sqrt_persistent, model.sqrt_persistent
+    a_new, a_model = (sign * a_new[0], a_new[1]), (a_model[0] + lever * a_model[1], a_model[1])
+    roots = [(a_new[0] - a_model[0], a_new[1] - a_model[1])] if pose_error == "persistent" else [a_new, a_model]
+    for by_offset, by_angle in roots:
+        var_angle = var_angle + jnp.sum(by_angle**2)
+        covariance = covariance + jnp.sum(by_offset * by_angle)
+        var_offset = var_offset + jnp.sum(by_offset**2)
     det = var_offset * var_angle - covariance**2
     weighted = var_angle * offset**2 - 2 * covariance * offset * turn + var_offset * turn**2
     nis = weighted / jnp.where(det > 0, det, 1)
 
-    parallel = jnp.abs(turn) < jnp.maximum(thresholds.match_angle, thresholds.match_sigmas * jnp.sqrt(var_angle))
-    near, along = parallel, []
-    for own, end in ((new.extent[0], new.begin), (new.extent[1], new.end)):
+    # Gates are compared as squares; that saves the square roots.
+    near = turn**2 < jnp.maximum(thresholds.match_angle**2, thresholds.match_sigmas**2 * var_angle)
+    along = []
+    for end in (new.begin, new.end):
         from_anchor = end - model.anchor
         s = dot(tangent, from_anchor)
-        across = jnp.abs(dot(normal, from_anchor) - model.offset)
-        spread = jnp.sqrt(normal_variance(model.cov, s) + normal_variance(new.cov, own))
-        near = near & (across < jnp.maximum(thresholds.match_distance, thresholds.match_sigmas * spread))
+        across = dot(normal, from_anchor) - model.offset
+        from_new = s + lever
+        variance = var_offset - 2 * from_new * covariance + from_new**2 * var_angle
+        near = near & (across**2 < jnp.maximum(thresholds.match_distance**2, thresholds.match_sigmas**2 * variance))
         along.append(s)
     gap = jnp.maximum(jnp.minimum(*along) - model.extent[1], model.extent[0] - jnp.maximum(*along))
     return LineComparison(
@@ -78,6 +91,7 @@ def compare_lines(new: Lines, model: Lines, thresholds: Thresholds) -> LineCompa
         sign=sign,
         nis=nis,
         gap=gap,
+        collinear=new.valid & model.valid & near,
         geometric=new.valid & model.valid & near & (gap < thresholds.match_gap),
     )
 
@@ -86,6 +100,7 @@ def best_line(
     new: Lines,
     model: Lines,
     thresholds: Thresholds,
+    pose_error: PoseError,
     *,
     among: Bool[Array, "L K"] | None = None,
     overlapping: bool = False,
@@ -99,6 +114,7 @@ def best_line(
       new: `L` new lines.
       model: `K` lines of the map.
       thresholds: `match_...`.
+      pose_error: its model.
       among: the pairs that are considered; all unless given.
       overlapping: whether the segments must overlap.
 
@@ -108,14 +124,14 @@ def best_line(
     """
 
     def score(a: Lines, b: Lines) -> Float[Array, ""]:
-        pair = compare_lines(a, b, thresholds)
+        pair = compare_lines(a, b, thresholds, pose_error)
         counts = pair.geometric & (pair.gap < 0) if overlapping else pair.geometric
         return jnp.where(counts, pair.nis + OVERLAP_WEIGHT * pair.gap, jnp.inf)
 
     by_model = jax.vmap(score, (None, 0))
     scores = jax.vmap(by_model, (0, None))(new, model)
     slot, best = least(scores if among is None else jnp.where(among, scores, jnp.inf))
-    nis = jax.vmap(lambda a, b: compare_lines(a, b, thresholds).nis)(new, take(model, slot))
+    nis = jax.vmap(lambda a, b: compare_lines(a, b, thresholds, pose_error).nis)(new, take(model, slot))
     return slot, jnp.where(jnp.isfinite(best), nis, jnp.inf)
 
 
@@ -137,21 +153,51 @@ class LineMatches:
     slot: Int[Array, " L"]  # of the map, -1 for none
     suspect: Int[Array, " L"]  # the line of the map that made a new line ambiguous, -1 for none
     nis: Float[Array, " L"]  # of the best geometric candidate, before the statistical gate; 0 for none
-    compared: Bool[Array, " L"]  # there was a geometric candidate
+    compared: Bool[Array, " L"]  # there was a geometric candidate that was not another line's
 
 
-def match_lines(new: Lines, model: Lines, thresholds: Thresholds, rules: Rules) -> LineMatches:
+def compare_pieces(new: Lines, thresholds: Thresholds) -> LineComparison:
+    """Hold the lines of a scan against each other, each with each: `[L, L]`.
+
+    They share the pose: what its error adds to both is the same, and the sensor's noise alone tells them apart.
+    """
+
+    def compare(a: Lines, b: Lines) -> LineComparison:
+        return compare_lines(a, b, thresholds, "persistent")
+
+    return jax.vmap(jax.vmap(compare, (None, 0)), (0, None))(new, new)
+
+
+def match_lines(
+    new: Lines,
+    model: Lines,
+    collinear: Bool[Array, "L L"],
+    thresholds: Thresholds,
+    rules: Rules,
+    pose_error: PoseError,
+) -> LineMatches:
     """Find for each new line the line of the map that it is: section 5.1.1.
+
+    A scan that sees two parallel lines knows that they are two, however uncertain its pose is. Not in the paper: of
+    several new lines that are next to the same line of the map, only those match it that are collinear with the best;
+    the others are new.
 
     Args:
       new: the lines of a scan.
       model: the lines of the map.
+      collinear: which lines of the scan may be pieces of one line.
       thresholds: `match_...`.
-      rules: `leave_out_ambiguous`.
+      rules: `share_pose`, `leave_out_ambiguous`.
+      pose_error: its model.
     """
-    slot, nis = best_line(new, model, thresholds)
+    slot, nis = best_line(new, model, thresholds, pose_error)
     compared = jnp.isfinite(nis)
     matched = nis < thresholds.match_nis
+    if rules.share_pose:
+        same = (slot[:, None] == slot[None]) & matched[None]
+        best, _ = least(jnp.where(same, nis[None], jnp.inf))
+        another = jnp.any(same, -1) & ~collinear[jnp.arange(best.shape[0]), best]
+        matched, compared = matched & ~another, compared & ~another
     ambiguous = compared & ~matched & rules.leave_out_ambiguous
     return LineMatches(
         slot=jnp.where(matched, slot, -1),
@@ -161,26 +207,20 @@ def match_lines(new: Lines, model: Lines, thresholds: Thresholds, rules: Rules) 
     )
 
 
-def group_lines(
-    new: Lines, cov: Float[Array, "L 2 2"], unmatched: Bool[Array, " L"], thresholds: Thresholds
-) -> Int[Array, " L"]:
+def group_lines(pair: LineComparison, unmatched: Bool[Array, " L"], thresholds: Thresholds) -> Int[Array, " L"]:
     """Pieces of one wall that the map does not hold yet: for each unmatched line the one that leads its group.
 
     The paper takes the lines of a scan one after the other, so that a second piece finds the first one in the map. Here
     all are taken at once, and this stands in for it.
 
     Args:
-      new: the lines of a scan.
-      cov: the covariances to compare by.
+      pair: the lines of the scan held against each other.
       unmatched: the lines that are to be grouped.
       thresholds: `match_...`.
 
     Returns:
       The slot of the leader, its own for a leader, -1 for lines that are not unmatched. Shape `[L]`.
     """
-    with_cov = dataclasses.replace(new, cov=cov)
-    by_model = jax.vmap(compare_lines, (None, 0, None))
-    pair = jax.vmap(by_model, (0, None, None))(with_cov, with_cov, thresholds)
     agree = pair.geometric & (pair.nis < thresholds.match_nis)
     score = jnp.where(agree, pair.nis + OVERLAP_WEIGHT * pair.gap, jnp.inf)
     index = jnp.arange(unmatched.shape[0])
@@ -205,7 +245,9 @@ class CircleMatches:
     ambiguous: Bool[Array, " C"]  # near a circle, but not it
 
 
-def match_circles(new: Circles, model: Circles, thresholds: Thresholds, rules: Rules) -> CircleMatches:
+def match_circles(
+    new: Circles, model: Circles, thresholds: Thresholds, rules: Rules, pose_error: PoseError
+) -> CircleMatches:
     """Find for each new circle the circle of the map that it is: section 5.2.1.
 
     The nearest is taken. The paper's one criterion is the distance of the centres; fitted circles have a covariance,
@@ -220,7 +262,12 @@ def match_circles(new: Circles, model: Circles, thresholds: Thresholds, rules: R
     mine = take(model, slot)
     both = near & new.fitted & mine.fitted
     change = jnp.concatenate([new.center - mine.center, (new.radius - mine.radius)[:, None]], -1)
-    cov = jnp.where(both[:, None, None], new.cov + mine.cov, jnp.eye(3, dtype=change.dtype)[None])
+    cov = new.cov_independent + mine.cov_independent
+    if pose_error == "persistent":
+        cov = cov + squared(new.sqrt_persistent - mine.sqrt_persistent)
+    else:
+        cov = cov + squared(new.sqrt_persistent) + squared(mine.sqrt_persistent)
+    cov = jnp.where(both[:, None, None], cov, jnp.eye(3, dtype=change.dtype)[None])
     nis = jnp.where(both, quadratic(change, inverse(cov)), 0)
     matched = near & (~both | (nis < thresholds.circle_match_nis)) if rules.weigh_circles else near
     return CircleMatches(

@@ -32,7 +32,7 @@ def propagate(jac: Float[Array, "*s m n"], cov: Float[Array, "*#s n n"]) -> Floa
     return symmetric(product(product(jac, cov), jnp.swapaxes(jac, -1, -2)))
 
 
-def product(a: Float[Array, "*s l m"], b: Float[Array, "*s m n"]) -> Float[Array, "*s l n"]:
+def product(a: Float[Array, "*#s l m"], b: Float[Array, "*#s m n"]) -> Float[Array, "*s l n"]:
     """Matrix product of many small matrices.
 
     Written as a sum, which XLA fuses with what stands around it; its batched matrix product is a kernel of its own.
@@ -69,6 +69,24 @@ def inverse(matrix: Float[Array, "*s n n"]) -> Float[Array, "*s n n"]:
     scale = 1 / jnp.where(det > 0, det, 1)
     rows = [[c00, c01, c02], [c01, c11, c12], [c02, c12, c22]]
     return _from_rows(rows) * scale[..., None, None]
+
+
+def square_root(matrix: Float[Array, "*s n n"]) -> Float[Array, "*s n n"]:
+    """The lower triangular L of A = L L^T for positive semidefinite matrices of a small order (Cholesky).
+
+    A direction without variance gives a column of zeros; its gradient is zero too.
+    """
+    n = matrix.shape[-1]
+    lower = [[jnp.zeros_like(matrix[..., 0, 0])] * n for _ in range(n)]
+    for j in range(n):
+        left = matrix[..., j, j] - sum(lower[j][k] ** 2 for k in range(j))
+        positive = left > 0
+        # Twice, so that the gradient of the branch not taken is finite.
+        lower[j][j] = jnp.where(positive, jnp.sqrt(jnp.where(positive, left, 1)), 0)
+        scale = jnp.where(positive, 1 / jnp.where(positive, lower[j][j], 1), 0)
+        for i in range(j + 1, n):
+            lower[i][j] = (matrix[..., i, j] - sum(lower[i][k] * lower[j][k] for k in range(j))) * scale
+    return _from_rows(lower)
 
 
 def quadratic(vector: Float[Array, "*s n"], matrix: Float[Array, "*s n n"]) -> Float[Array, "*s"]:

@@ -17,6 +17,7 @@ Number = float | Float[Array, ""]
 Segmentation = Literal["incremental"]
 Covariance = Literal["exact", "printed"]
 Jacobians = Literal["autodiff", "analytic"]
+PoseError = Literal["independent", "persistent", "unknown"]
 
 
 @pytree
@@ -42,8 +43,9 @@ class Thresholds:
     cluster_distance: Number = 0.3
     """[d_critc] Largest distance of a new point from the centre of its cluster, m; also the largest radius of a fitted
     circle."""
-    circle_line_distance: Number = 0.15
-    """Circles whose centre is closer than this to a line are not modelled, m (s4.3.1)."""
+    circle_line_distance: Number = 0.1
+    """Circles whose centre is closer than this to a line are not modelled, m (s4.3.1): five sigma of a range of 2 cm,
+    since it is the noise of the line that is meant. `paper`: 0.15."""
     match_angle: Number = 0.05
     """[delta theta_crit] Largest difference of direction of matching lines, rad. `paper`: 0.175 (10 degrees)."""
     match_distance: Number = 0.05
@@ -98,6 +100,33 @@ class Mount:
     """Turn of the scanner, counter-clockwise, rad. Not in the paper, where the scanner looks ahead."""
 
 
+@pytree
+class Persistence:
+    """How the pose error goes on from scan to scan, for `pose_error="persistent"`.
+
+    The pose error is the sum of a part that is new in every scan and a part that persists and drifts: in units of its
+    sigma, u[k+1] = correlation u[k] + sqrt(1 - correlation^2) w.
+    """
+
+    share: Number = 1.0
+    """The part of the pose's covariance that persists, from 0 to 1."""
+    correlation: Number = 0.99
+    """Of what persists, from one scan to the next, from 0 to 1. The error persists over 1 / (1 - correlation) scans."""
+
+
+def persistence_of(pose_error: PoseError, persistence: Persistence | None) -> Persistence:
+    """What of a pose error persists under a model of it; where nothing is known, all of it may.
+
+    Raises:
+      ValueError: if there is no such model.
+    """
+    if pose_error == "persistent":
+        return persistence or Persistence()
+    if pose_error in ("independent", "unknown"):
+        return Persistence(share=0.0 if pose_error == "independent" else 1.0, correlation=1.0)
+    raise ValueError(f"pose_error must be 'independent', 'persistent' or 'unknown', not {pose_error!r}")
+
+
 class Capacity(NamedTuple):
     """Number of slots: of a map, or of what one scan may hold. Static: it is part of the compiled shape."""
 
@@ -120,7 +149,8 @@ class Rules:
     """Fit a circle to a cluster where there are points enough. Eqs. (18)-(20) describe the visible arc: a centre that
     lies before the pole's and moves with the viewpoint."""
     share_pose: bool = True
-    """Pieces of one line in one scan share its pose error: it is counted once."""
+    """Pieces of one line in one scan share its pose error: it is counted once, and it does not make one of two lines
+    that the scan has seen side by side."""
     leave_out_ambiguous: bool = True
     """A new line that passes the geometric gates but fails the statistical one is neither fused nor added. To add
     it, as the paper does, holds the same wall twice: the gate turns true matches away too."""
@@ -142,6 +172,7 @@ PAPER_THRESHOLDS = Thresholds(
     gap_beams=1.5,
     line_distance=0.05,
     line_sigmas=0.0,
+    circle_line_distance=0.15,
     match_angle=0.175,
     match_distance=0.2,
     match_sigmas=0.0,

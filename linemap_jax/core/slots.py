@@ -8,7 +8,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -55,13 +55,16 @@ def free_slots(wanted: Bool[Array, " M"], taken: Bool[Array, " K"]) -> tuple[Int
     return jnp.where(fits, slot, -1).astype(jnp.int32), jnp.any(wanted & ~fits)
 
 
+TreeT = TypeVar("TreeT")
+
+
 def neutral_where_free(slots: SlotsT) -> SlotsT:
     """The same lines or circles with neutral values in every free slot, so that nothing non-finite lurks there."""
     return choose(slots.valid, slots, _empty_like(slots, slots.valid.shape[0]))
 
 
-def choose(first: Bool[Array, " K"], a: SlotsT, b: SlotsT) -> SlotsT:
-    """The lines or circles of `a` where `first` holds, of `b` elsewhere."""
+def choose(first: Bool[Array, " K"], a: TreeT, b: TreeT) -> TreeT:
+    """The items of `a` where `first` holds, of `b` elsewhere."""
     return jax.tree.map(lambda x, y: jnp.where(first.reshape(first.shape + (1,) * (x.ndim - 1)), x, y), a, b)
 
 
@@ -125,4 +128,4 @@ def resize(slots: SlotsT, capacity: int) -> SlotsT:
 
 def _empty_like(slots: SlotsT, capacity: int) -> SlotsT:
     empty: Any = empty_lines if isinstance(slots, Lines) else empty_circles
-    return empty(capacity, slots.cov.dtype)
+    return empty(capacity, slots.cov_independent.dtype)

@@ -108,16 +108,26 @@ class Lines:
     Its end points are given along the tangent (the normal turned by +90 degrees), measured from the anchor, so that
     they lie on the line by construction. (rho, theta) of Eq. (1) is a view, `rho_theta`: as a state it fails near the
     origin of the world and far from it.
+
+    The covariance has two parts. Errors that are new in every scan average away; those of a pose error that persists do
+    not, and are kept apart: to first order the error of (offset, angle) is `sqrt_persistent @ u` plus an independent
+    one, where u is the persisting part of the pose error in units of its own sigma.
     """
 
     anchor: Float[Array, "K 2"]  # m, world
     offset: Float[Array, " K"]  # m, along the normal
     angle: Float[Array, " K"]  # rad, direction of the normal
-    cov: Float[Array, "K 2 2"]  # of (offset, angle): m^2, m rad, rad^2
+    cov_independent: Float[Array, "K 2 2"]  # of (offset, angle): m^2, m rad, rad^2; what no other scan shares
+    sqrt_persistent: Float[Array, "K 2 3"]  # square root of what other scans may share: m, rad
     extent: Float[Array, "K 2"]  # m, begin and end along the tangent; begin <= end
     var_extent: Float[Array, "K 2"]  # m^2, of the end points along the tangent
     times_detected: Int[Array, " K"]
     valid: Bool[Array, " K"]
+
+    @property
+    def cov(self) -> Float[Array, "K 2 2"]:
+        """Covariance of (offset, angle): m^2, m rad, rad^2. Shape `[K, 2, 2]`."""
+        return self.cov_independent + squared(self.sqrt_persistent)
 
     @property
     def normal(self) -> Float[Array, "K 2"]:
@@ -153,16 +163,22 @@ class Lines:
 class Circles:
     """Circles: clusters of points after Eqs. (18)-(20), or fitted poles.
 
-    `fitted` tells which: a fitted circle is the pole itself and has a covariance; the others describe the visible
-    points and have none (zeros).
+    `fitted` tells which: a fitted circle is the pole itself and has a covariance, in two parts as that of a line; the
+    others describe the visible points and have none (zeros).
     """
 
     center: Float[Array, "K 2"]  # m, world
     radius: Float[Array, " K"]  # m
-    cov: Float[Array, "K 3 3"]  # of (x, y, radius), m^2
+    cov_independent: Float[Array, "K 3 3"]  # of (x, y, radius), m^2; what no other scan shares
+    sqrt_persistent: Float[Array, "K 3 3"]  # square root of what other scans may share, m
     fitted: Bool[Array, " K"]
     times_detected: Int[Array, " K"]
     valid: Bool[Array, " K"]
+
+    @property
+    def cov(self) -> Float[Array, "K 3 3"]:
+        """Covariance of (x, y, radius) in m^2. Shape `[K, 3, 3]`."""
+        return self.cov_independent + squared(self.sqrt_persistent)
 
 
 @pytree
@@ -231,6 +247,11 @@ class Report:
 
 SlotsT = TypeVar("SlotsT", Lines, Circles)
 
+
+def squared(root: Float[Array, "*s n m"]) -> Float[Array, "*s n n"]:
+    """A A^T, the matrix of which A is a square root."""
+    return jnp.sum(root[..., :, None, :] * root[..., None, :, :], -1)
+
 NEW = -1
 """In a `Report`: the primitive was added to the map."""
 LEFT_OUT = -2
@@ -244,7 +265,8 @@ def empty_lines(capacity: int, dtype: Any = None) -> Lines:
         anchor=_filled((capacity, 2), 0, dtype),
         offset=_filled((capacity,), 0, dtype),
         angle=_filled((capacity,), 0, dtype),
-        cov=jnp.asarray(np.tile(np.eye(2, dtype=dtype), (capacity, 1, 1))),
+        cov_independent=jnp.asarray(np.tile(np.eye(2, dtype=dtype), (capacity, 1, 1))),
+        sqrt_persistent=_filled((capacity, 2, 3), 0, dtype),
         extent=_filled((capacity, 2), 0, dtype),
         var_extent=_filled((capacity, 2), 1, dtype),
         times_detected=_filled((capacity,), 0, np.int32),
@@ -258,7 +280,8 @@ def empty_circles(capacity: int, dtype: Any = None) -> Circles:
     return Circles(
         center=_filled((capacity, 2), 0, dtype),
         radius=_filled((capacity,), 0, dtype),
-        cov=_filled((capacity, 3, 3), 0, dtype),
+        cov_independent=_filled((capacity, 3, 3), 0, dtype),
+        sqrt_persistent=_filled((capacity, 3, 3), 0, dtype),
         fitted=_filled((capacity,), False, bool),
         times_detected=_filled((capacity,), 0, np.int32),
         valid=_filled((capacity,), False, bool),

@@ -1,9 +1,9 @@
 """The map as a JSON file that other tools read, and from which the map comes back without loss.
 
 A line is given twice: as the paper's view, `rho`, `theta`, `cov` of both, `begin`, `end`; and as its state, `anchor`,
-`offset`, `angle`, `cov_local`, `extent`, `var_extent` (the fields of `Lines`), which alone is read back. A circle has a
-`cov`, of (x, y, radius), only if it was fitted. Metres, radians, counter-clockwise. Each line and each circle stands on
-one line of the file.
+`offset`, `angle`, `cov_independent`, `sqrt_persistent`, `extent`, `var_extent` (the fields of `Lines`), which alone is
+read back; `cov_local` is the covariance of offset and angle. A circle has a `cov`, of (x, y, radius), and its two parts,
+only if it was fitted. Metres, radians, counter-clockwise. Each line and each circle stands on one line of the file.
 """
 
 import dataclasses
@@ -28,9 +28,19 @@ Columns = dict[str, NDArray[Any]]
 FORMAT = "linemap"
 VERSION = 1
 
-_LINE_STATE = {"anchor": (2,), "offset": (), "angle": (), "cov_local": (2, 2), "extent": (2,), "var_extent": (2,)}
-_LINE_VIEW = {"rho": (), "theta": (), "cov": (2, 2), "begin": (2,), "end": (2,)}
+_LINE_STATE = {
+    "anchor": (2,),
+    "offset": (),
+    "angle": (),
+    "cov_independent": (2, 2),
+    "sqrt_persistent": (2, 3),
+    "extent": (2,),
+    "var_extent": (2,),
+}
+_LINE_VIEW = {"rho": (), "theta": (), "cov": (2, 2), "begin": (2,), "end": (2,), "cov_local": (2, 2)}
 _CIRCLE = {"center": (2,), "radius": ()}
+_FIT_STATE = {"cov_independent": (3, 3), "sqrt_persistent": (3, 3)}
+_FIT_VIEW = {"cov": (3, 3)}
 
 _ROUNDING = 1e-5
 """How far rounding to float32 may carry a correlation, or the view's, from what it should be; no unit."""
@@ -64,7 +74,7 @@ def write_map(
         document = {
             "format": FORMAT,
             "version": VERSION,
-            "dtype": str(line_map.lines.cov.dtype),
+            "dtype": str(line_map.lines.offset.dtype),
             "settings": _plain(settings, "settings"),
             "lines": _entries_of_lines(line_map.lines),
             "circles": _entries_of_circles(line_map.circles),
@@ -122,22 +132,23 @@ def read_map(
 @jax.jit  # step by step, each operation would be compiled by itself: a second for the first file
 def _view(lines: Lines) -> tuple[jax.Array, ...]:
     """The fields of `_LINE_VIEW`."""
-    return *rho_theta(lines), lines.begin, lines.end
+    return *rho_theta(lines), lines.begin, lines.end, lines.cov
 
 
 def _entries_of_lines(lines: Lines) -> list[dict[str, Any]]:
     view = dict(zip(_LINE_VIEW, _view(lines), strict=True))
-    state = {name: lines.cov if name == "cov_local" else getattr(lines, name) for name in _LINE_STATE}
+    state = {name: getattr(lines, name) for name in _LINE_STATE}
     return _entries({**view, "times_detected": lines.times_detected, **state}, lines.valid)
 
 
 def _entries_of_circles(circles: Circles) -> list[dict[str, Any]]:
-    columns = {name: getattr(circles, name) for name in ("center", "radius", "times_detected", "cov")}
-    entries = _entries(columns, circles.valid)
+    names = (*_CIRCLE, "times_detected", *_FIT_VIEW, *_FIT_STATE)
+    entries = _entries({name: getattr(circles, name) for name in names}, circles.valid)
     fitted = np.asarray(circles.fitted)[np.asarray(circles.valid)]
     for entry, has_cov in zip(entries, fitted, strict=True):
         if not has_cov:
-            del entry["cov"]
+            for name in (*_FIT_VIEW, *_FIT_STATE):
+                del entry[name]
     return entries
 
 
@@ -227,12 +238,12 @@ def _read_lines(document: dict[str, Any]) -> Columns:
         name: _column(entries, "lines", name, shape, document["dtype"])
         for name, shape in (_LINE_VIEW | _LINE_STATE).items()
     }
-    _check_cov(columns["cov"], "lines", "cov", slack=_ROUNDING)
-    _check_cov(columns["cov_local"], "lines", "cov_local")
+    for name in ("cov", "cov_local"):
+        _check_cov(columns[name], "lines", name, slack=_ROUNDING)
+    _check_cov(columns["cov_independent"], "lines", "cov_independent")
     _check(columns["extent"][:, 0] <= columns["extent"][:, 1], "lines", "extent", "runs backwards")
     _check(columns["var_extent"].min(1) >= 0, "lines", "var_extent", "is negative")
-    state = {"cov" if name == "cov_local" else name: columns[name] for name in _LINE_STATE}
-    return state | _counts(entries, "lines")
+    return {name: columns[name] for name in _LINE_STATE} | _counts(entries, "lines")
 
 
 def _read_circles(document: dict[str, Any]) -> Columns:
@@ -242,10 +253,14 @@ def _read_circles(document: dict[str, Any]) -> Columns:
     columns = {name: _column(entries, "circles", name, shape, dtype) for name, shape in _CIRCLE.items()}
     _check(columns["radius"] >= 0, "circles", "radius", "is negative")
     fitted = np.array(["cov" in entry for entry in entries], bool)
-    none = np.zeros((3, 3)).tolist()
-    cov = _column([{"cov": none, **entry} for entry in entries], "circles", "cov", (3, 3), dtype)
-    _check_cov(cov, "circles", "cov", exempt=~fitted)
-    return columns | {"cov": cov, "fitted": fitted} | _counts(entries, "circles")
+    shapes = _FIT_STATE | _FIT_VIEW
+    none = {name: np.zeros(shape).tolist() for name, shape in shapes.items()}
+    entries = [entry if has_cov else none | entry for entry, has_cov in zip(entries, fitted, strict=True)]
+    fits = {name: _column(entries, "circles", name, shape, dtype) for name, shape in shapes.items()}
+    _check_cov(fits["cov"], "circles", "cov", exempt=~fitted, slack=_ROUNDING)
+    _check_cov(fits["cov_independent"], "circles", "cov_independent", exempt=~fitted)
+    state = {name: fits[name] for name in _FIT_STATE}
+    return columns | state | {"fitted": fitted} | _counts(entries, "circles")
 
 
 def _list_of_objects(document: dict[str, Any], kind: str) -> list[dict[str, Any]]:
