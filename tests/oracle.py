@@ -8,15 +8,20 @@ The letters, in the frame of the world unless said otherwise: `p` is the positio
 of the scanner relative to it, `o` a measured point relative to it, `u` the direction of a beam; `normal` has the
 direction `angle`, `tangent` is the normal turned by +90 degrees. Points are taken relative to the robot, so that
 nothing depends on how far away the origin of the world is.
+
+The error of a line, (offset, angle), or of a fitted circle, (x, y, radius), has two parts: one that is independent from
+scan to scan, with covariance `c`, and `a @ u`, where u holds three numbers of variance one that the scan's pose error
+may share with those of other scans. Its covariance is `c + a a^T`.
 """
 
 import dataclasses
 import math
 from types import SimpleNamespace
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 
+from linemap_jax.core.settings import PoseError
 from linemap_jax.core.state import LEFT_OUT, NEW, Status
 
 # A beam that is closer than this to parallel to a line (cosine of the angle to its normal) does not cross it.
@@ -38,11 +43,17 @@ class Lines:
     anchor: np.ndarray  # [K, 2]
     offset: np.ndarray  # [K]
     angle: np.ndarray  # [K]
-    cov: np.ndarray  # [K, 2, 2]
+    cov_independent: np.ndarray  # [K, 2, 2]
+    sqrt_persistent: np.ndarray  # [K, 2, 3]
     extent: np.ndarray  # [K, 2]
     var_extent: np.ndarray  # [K, 2]
     times_detected: np.ndarray  # [K]
     valid: np.ndarray  # [K]
+
+    @property
+    def cov(self) -> np.ndarray:
+        """Covariances of (offset, angle). Shape `[K, 2, 2]`."""
+        return self.cov_independent + squared(self.sqrt_persistent)
 
     @property
     def normal(self) -> np.ndarray:
@@ -80,10 +91,16 @@ class Circles:
 
     center: np.ndarray  # [K, 2]
     radius: np.ndarray  # [K]
-    cov: np.ndarray  # [K, 3, 3]
+    cov_independent: np.ndarray  # [K, 3, 3]
+    sqrt_persistent: np.ndarray  # [K, 3, 3]
     fitted: np.ndarray  # [K]
     times_detected: np.ndarray  # [K]
     valid: np.ndarray  # [K]
+
+    @property
+    def cov(self) -> np.ndarray:
+        """Covariances of (x, y, radius). Shape `[K, 3, 3]`."""
+        return self.cov_independent + squared(self.sqrt_persistent)
 
 
 @dataclasses.dataclass
@@ -209,6 +226,21 @@ def sandwich(a: np.ndarray, cov: np.ndarray) -> np.ndarray:
 def symmetric(a: np.ndarray) -> np.ndarray:
     """The symmetric part: what rounding leaves beside it would grow from fusion to fusion."""
     return 0.5 * (a + np.swapaxes(a, -1, -2))
+
+
+def squared(a: np.ndarray) -> np.ndarray:
+    """`a a^T`."""
+    return a @ np.swapaxes(a, -1, -2)
+
+
+def lower_root(a: np.ndarray) -> np.ndarray:
+    """The lower triangular root of a positive semidefinite matrix; a pivot of zero gives a column of zeros."""
+    rest, root = np.array(a, float), np.zeros(a.shape)
+    for j in range(len(a)):
+        if rest[j, j] > 0:
+            root[j:, j] = rest[j:, j] / math.sqrt(rest[j, j])
+            rest -= np.outer(root[:, j], root[:, j])
+    return root
 
 
 def distance_to_segments(point: np.ndarray, lines: Lines) -> np.ndarray:
@@ -446,11 +478,10 @@ def _line_of_run(
     if covariance == "printed":
         # Departure that the paper makes, not we: Eq. (12) sums the pose error as if each point had its own.
         cov_measurement = symmetric(sandwich(j, cov_points).sum(0))
-        jac_line_pose, cov = np.zeros((2, 3)), cov_measurement
+        jac_line_pose = np.zeros((2, 3))
     else:
         cov_measurement = symmetric(sandwich(j, cov_sensor).sum(0))
         jac_line_pose = (j @ f).sum(0)
-        cov = symmetric(cov_measurement + sandwich(jac_line_pose, sweep.cov_pose))
 
     var_extent = np.zeros(2)
     for side, k in ((0, 0), (1, -1)):
@@ -460,7 +491,8 @@ def _line_of_run(
         "anchor": anchor,
         "offset": offset,
         "angle": line.angle,
-        "cov": cov,
+        "cov_independent": cov_measurement,
+        "sqrt_persistent": jac_line_pose @ lower_root(sweep.cov_pose),
         "extent": extent,
         "var_extent": var_extent,
         "cov_measurement": cov_measurement,
@@ -575,7 +607,8 @@ def _circle_of_cluster(
     plain = {
         "center": sweep.p + centroid,
         "radius": math.sqrt((z**2).sum() / (n - 1)),
-        "cov": np.zeros((3, 3)),
+        "cov_independent": np.zeros((3, 3)),
+        "sqrt_persistent": np.zeros((3, 3)),
         "fitted": False,
     }
     if not rules.fit_circles:
@@ -599,7 +632,8 @@ def _circle_of_cluster(
     return {
         "center": sweep.p + center,
         "radius": fit.radius,
-        "cov": symmetric(fit.cov + sandwich(q, sweep.cov_pose)),
+        "cov_independent": fit.cov,
+        "sqrt_persistent": q @ lower_root(sweep.cov_pose),
         "fitted": True,
     }
 
@@ -673,7 +707,8 @@ def extract(
         anchor=_stack(found, "anchor", (2,)),
         offset=_stack(found, "offset", ()),
         angle=_stack(found, "angle", ()),
-        cov=_stack(found, "cov", (2, 2)),
+        cov_independent=_stack(found, "cov_independent", (2, 2)),
+        sqrt_persistent=_stack(found, "sqrt_persistent", (2, 3)),
         extent=_stack(found, "extent", (2,)),
         var_extent=_stack(found, "var_extent", (2,)),
         times_detected=np.ones(len(found), int),
@@ -699,7 +734,8 @@ def extract(
     circles = Circles(
         center=_stack(kept, "center", (2,)),
         radius=_stack(kept, "radius", ()),
-        cov=_stack(kept, "cov", (3, 3)),
+        cov_independent=_stack(kept, "cov_independent", (3, 3)),
+        sqrt_persistent=_stack(kept, "sqrt_persistent", (3, 3)),
         fitted=_stack(kept, "fitted", ()).astype(bool),
         times_detected=np.ones(len(kept), int),
         valid=np.ones(len(kept), bool),
@@ -734,7 +770,8 @@ def empty_map(capacity: Any) -> OracleMap:
             anchor=np.zeros((k, 2)),
             offset=np.zeros(k),
             angle=np.zeros(k),
-            cov=np.tile(np.eye(2), (k, 1, 1)),
+            cov_independent=np.tile(np.eye(2), (k, 1, 1)),
+            sqrt_persistent=np.zeros((k, 2, 3)),
             extent=np.zeros((k, 2)),
             var_extent=np.ones((k, 2)),
             times_detected=np.zeros(k, int),
@@ -743,7 +780,8 @@ def empty_map(capacity: Any) -> OracleMap:
         circles=Circles(
             center=np.zeros((c, 2)),
             radius=np.zeros(c),
-            cov=np.zeros((c, 3, 3)),
+            cov_independent=np.zeros((c, 3, 3)),
+            sqrt_persistent=np.zeros((c, 3, 3)),
             fitted=np.zeros(c, bool),
             times_detected=np.zeros(c, int),
             valid=np.zeros(c, bool),
@@ -774,6 +812,81 @@ def _lowest_free(slots: Any) -> int | None:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
+# Errors in two parts
+
+Slots = TypeVar("Slots", Lines, Circles)
+
+
+class Error(NamedTuple):
+    """What is known of the error of one line or circle."""
+
+    c: np.ndarray  # [n, n], covariance of the independent part
+    a: np.ndarray  # [n, 3], square root of the persisting part
+    times: int  # how many scans it rests on
+
+
+def _error_of(slots: Any, i: int) -> Error:
+    return Error(slots.cov_independent[i], slots.sqrt_persistent[i], int(slots.times_detected[i]))
+
+
+def forget(slots: Slots, share: float) -> Slots:
+    """The same lines or circles, of whose persisting errors only this share goes on; the rest is independent."""
+    rest = (1 - share) * squared(slots.sqrt_persistent)
+    return dataclasses.replace(
+        slots,
+        cov_independent=slots.cov_independent + rest,
+        sqrt_persistent=math.sqrt(share) * slots.sqrt_persistent,
+    )
+
+
+def cov_shared(a_new: np.ndarray, a_old: np.ndarray, pose_error: PoseError) -> np.ndarray:
+    """What the persisting parts add to the covariance of new minus old.
+
+    If they persist by a known model, both are of one u, and what they have in common cancels.
+    """
+    if pose_error == "persistent":
+        return squared(a_new - a_old)
+    return squared(a_new) + squared(a_old)
+
+
+def combine(old: Error, new: Error, pose_error: PoseError) -> tuple[np.ndarray, Error]:
+    """The static Kalman filter of Eq. (23) for errors in two parts.
+
+    "independent" and "persistent": u is a state that both share and that is not estimated (Schmidt). "unknown": each
+    persisting part counts as if it were larger, by the inverse of its weight, which is its number of scans; and the
+    covariance of their sum is bounded for every correlation, by (x + y)(x + y)^T <= (1 + b/a) x x^T + (1 + a/b) y y^T.
+
+    Args:
+      old: of the estimate so far.
+      new: of an estimate of the same numbers.
+      pose_error: what is known of the persisting parts.
+
+    Returns:
+      The gain of the new estimate, and the error of the result.
+    """
+    one = np.eye(len(old.c))
+    if pose_error != "unknown":
+        apart = new.a - old.a
+        gain = (old.c - old.a @ apart.T) @ np.linalg.inv(old.c + new.c + squared(apart))
+        a = (one - gain) @ old.a + gain @ new.a
+    else:
+        weight = old.times / (old.times + new.times)
+        p_old, p_new = old.c + squared(old.a) / weight, new.c + squared(new.a) / (1 - weight)
+        metric = np.linalg.inv(p_old + p_new)
+        gain = p_old @ metric
+        from_old, from_new = squared((one - gain) @ old.a), squared(gain @ new.a)
+        size_old, size_new = (math.sqrt(np.trace(part @ metric)) for part in (from_old, from_new))
+        if size_old > 0 and size_new > 0:
+            bound = from_old * (1 + size_new / size_old) + from_new * (1 + size_old / size_new)
+        else:
+            bound = from_old + from_new
+        a = np.zeros(old.a.shape)
+        a[:, : len(one)] = lower_root(bound)
+    c = symmetric(sandwich(one - gain, old.c) + sandwich(gain, new.c))
+    return gain, Error(c, a, old.times + new.times)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 # Matching of lines
 
 
@@ -785,14 +898,15 @@ class Gates(NamedTuple):
     lever: np.ndarray  # [K], of the new line's anchor
     nis: np.ndarray  # [K], Eq. (21)
     gap: np.ndarray  # [K], m, along the map's line; negative where the two overlap
+    collinear: np.ndarray  # [K], the same line, were it boundless
     geometric: np.ndarray  # [K]
     statistical: np.ndarray  # [K], Eq. (22)
 
 
-def gates(new: Lines, old: Lines, *, thresholds: Any) -> Gates:
+def gates(new: Lines, old: Lines, *, thresholds: Any, pose_error: PoseError) -> Gates:
     """All gates of s5.1.1, for lines of equal number, or one against many.
 
-    Both lines are compared at the anchor of the new one, with the covariances that they come with.
+    Both lines are compared at the anchor of the new one. All gates ask for the covariance of their difference there.
     """
     t = _numbers(thresholds)
     d = wrap(new.angle - old.angle)
@@ -802,40 +916,41 @@ def gates(new: Lines, old: Lines, *, thresholds: Any) -> Gates:
     shift = old.anchor - new.anchor
     lever = dot(old.tangent, shift)
     residual = np.stack([sign * new.offset - (old.offset + dot(old.normal, shift)), turn], -1)
-    cov = signed_cov(new.cov, sign) + sandwich(lever_matrix(lever), old.cov)
+
+    s, flip = lever_matrix(lever), sign_matrix(sign)
+    cov = sandwich(flip, new.cov_independent) + sandwich(s, old.cov_independent)
+    cov = cov + cov_shared(flip @ new.sqrt_persistent, s @ old.sqrt_persistent, pose_error)
     nis = dot(residual, np.linalg.solve(cov, residual[..., None])[..., 0])
 
-    spread_angle = t.match_sigmas * np.sqrt(new.cov[:, 1, 1] + old.cov[:, 1, 1])
-    same_direction = np.abs(turn) < np.maximum(t.match_angle, spread_angle)
+    same_direction = turn**2 < np.maximum(t.match_angle**2, t.match_sigmas**2 * cov[:, 1, 1])
 
-    ends = np.stack([new.begin, new.end], 1) - old.anchor[:, None]
-    s = dot(ends, old.tangent[:, None])
-    distance = np.abs(dot(ends, old.normal[:, None]) - old.offset[:, None])
-    var = _var_across(old.cov, s) + _var_across(new.cov, new.extent)
-    same_line = (distance < np.maximum(t.match_distance, t.match_sigmas * np.sqrt(var))).all(-1)
+    ends = np.stack([new.begin, new.end], 1)
+    distance = dot(ends - old.anchor[:, None], old.normal[:, None]) - old.offset[:, None]
+    # With the tangent at +90 degrees a point of the line moves by d offset - u d angle across it.
+    u = dot(ends - new.anchor[:, None], old.tangent[:, None])
+    var = cov[:, None, 0, 0] - 2 * u * cov[:, None, 0, 1] + u**2 * cov[:, None, 1, 1]
+    same_line = (distance**2 < np.maximum(t.match_distance**2, t.match_sigmas**2 * var)).all(-1)
 
-    gap = np.maximum(s.min(-1) - old.extent[:, 1], old.extent[:, 0] - s.max(-1))
+    along = dot(ends - old.anchor[:, None], old.tangent[:, None])
+    gap = np.maximum(along.min(-1) - old.extent[:, 1], old.extent[:, 0] - along.max(-1))
+    collinear = same_direction & same_line & new.valid & old.valid
     return Gates(
         sign=sign,
         residual=residual,
         lever=lever,
         nis=nis,
         gap=gap,
-        geometric=same_direction & same_line & (gap < t.match_gap) & new.valid & old.valid,
+        collinear=collinear,
+        geometric=collinear & (gap < t.match_gap),
         statistical=nis < t.match_nis,
     )
 
 
-def signed_cov(cov: np.ndarray, sign: Any) -> np.ndarray:
-    """The covariance of (sign offset, angle). Shape `[..., 2, 2]`."""
-    sign = np.asarray(sign, float)
-    one = np.ones_like(sign)
-    return cov * np.stack([np.stack([one, sign], -1), np.stack([sign, one], -1)], -2)
-
-
-def _var_across(cov: np.ndarray, s: np.ndarray) -> np.ndarray:
-    """Variance across the line at `s` along it: with the tangent at +90 degrees a point moves by dh - s dtheta."""
-    return cov[:, None, 0, 0] - 2 * s * cov[:, None, 0, 1] + s**2 * cov[:, None, 1, 1]
+def sign_matrix(sign: Any) -> np.ndarray:
+    """What turns (offset, angle) into (sign offset, angle). Shape `[..., 2, 2]`."""
+    m = np.zeros((*np.shape(sign), 2, 2))
+    m[..., 0, 0], m[..., 1, 1] = sign, 1.0
+    return m
 
 
 def closest(g: Gates, good: np.ndarray, ties: Margin) -> int | None:
@@ -855,44 +970,64 @@ def closest(g: Gates, good: np.ndarray, ties: Margin) -> int | None:
 
 
 class Match(NamedTuple):
-    """What the map says of one new line."""
+    """What the map says of one new line or circle."""
 
     slot: int  # -1: none
-    suspect: int  # the line that it may be but for the statistical gate, -1: none
+    suspect: int  # what it may be but for the statistical gate, -1: none
     nis: float
     dof: int
 
 
-def match_line(new: Lines, lines: Lines, *, thresholds: Any, ties: Margin) -> Match:
-    """The line of the map that one new line (of length 1) is."""
-    slots = np.flatnonzero(lines.valid)
+NO_MATCH = Match(-1, -1, 0.0, 0)
+
+
+def match_line(
+    new: Lines, lines: Lines, slots: np.ndarray, *, thresholds: Any, pose_error: PoseError, ties: Margin
+) -> Match:
+    """The line of the map, of those in the given slots, that one new line (of length 1) is."""
     if not len(slots):
-        return Match(-1, -1, 0.0, 0)
-    g = gates(new, lines.take(slots), thresholds=thresholds)
+        return NO_MATCH
+    g = gates(new, lines.take(slots), thresholds=thresholds, pose_error=pose_error)
     best = closest(g, g.geometric, ties)
     if best is None:
-        return Match(-1, -1, 0.0, 0)
+        return NO_MATCH
     slot = int(slots[best])
     matched = bool(g.statistical[best])
     return Match(slot if matched else -1, -1 if matched else slot, float(g.nis[best]), 2)
 
 
-def group_new(
-    found: Extraction, unmatched: list[int], *, thresholds: Any, rules: Any, ties: Margin
-) -> dict[int, list[int]]:
+def pairs_of(lines: Lines, *, thresholds: Any) -> list[Gates]:
+    """Each line of a scan against all of them: one and the same pose error moves them all."""
+    n = len(lines.offset)
+    return [gates(lines.take(i), lines, thresholds=thresholds, pose_error="persistent") for i in range(n)]
+
+
+def part(matches: list[Match], pairs: list[Gates]) -> list[Match]:
+    """Take from lines of the map what the scan has seen beside them.
+
+    Of the new lines that match a line of the map the one with the least NIS is that line. The others are it only where
+    the scan itself, whose pose error is no matter between its lines, does not say that they are another one.
+    """
+    result = list(matches)
+    for slot in {match.slot for match in matches if match.slot >= 0}:
+        leader = min((match.nis, k) for k, match in enumerate(matches) if match.slot == slot)[1]
+        for i, match in enumerate(matches):
+            if slot in (match.slot, match.suspect) and not pairs[i].collinear[leader]:
+                result[i] = NO_MATCH
+    return result
+
+
+def group_new(pairs: list[Gates], unmatched: list[int], ties: Margin) -> dict[int, list[int]]:
     """New lines that are no line of the map, with those that continue them: root -> pieces, the root first."""
-    cov = found.cov_measurement if rules.share_pose else found.lines.cov
-    lines = dataclasses.replace(found.lines, cov=cov)
     groups: dict[int, list[int]] = {}
     for i in unmatched:
-        roots = list(groups)
-        if roots:
-            g = gates(lines.take(i), lines.take(roots), thresholds=thresholds)
-            best = closest(g, g.geometric & g.statistical, ties)
-            if best is not None:
-                groups[roots[best]].append(i)
-                continue
-        groups[i] = [i]
+        g = pairs[i]
+        is_root = np.isin(np.arange(len(pairs)), list(groups))
+        best = closest(g, g.geometric & g.statistical & is_root, ties)
+        if best is None:
+            groups[i] = [i]
+        else:
+            groups[best].append(i)
     return groups
 
 
@@ -900,52 +1035,32 @@ def group_new(
 # Fusion of lines
 
 
-class Pieces(NamedTuple):
-    """Observations of one line: `cov` is independent from piece to piece, the pose error behind `jac_pose` common."""
+def observe(target: Lines, pieces: Lines, *, share: float, thresholds: Any) -> tuple[np.ndarray, Error]:
+    """What pieces that one scan has seen of a line say of it together: least squares at the anchor of the target.
 
-    lines: Lines  # [n]
-    cov: np.ndarray  # [n, 2, 2]
-    jac_pose: np.ndarray  # [n, 2, 3]
-
-
-def pieces_of(found: Extraction, index: list[int], *, rules: Any) -> Pieces:
-    """The new lines at `index` as observations."""
-    if rules.share_pose:
-        return Pieces(found.lines.take(index), found.cov_measurement[index], found.jac_line_pose[index])
-    return Pieces(found.lines.take(index), found.lines.cov[index], np.zeros((len(index), 2, 3)))
-
-
-def fuse(
-    target: Lines, pieces: Pieces, cov_pose: np.ndarray, *, prior: bool, thresholds: Any
-) -> tuple[float, float, np.ndarray]:
-    """The static Kalman filter of Eq. (23), in information form, at the anchor of the target.
+    The scan moves all of its pieces by one pose error, which is no noise between them.
 
     Args:
-      target: the line (of length 1) that is improved; where the equations are linearised.
-      pieces: what was seen of it.
-      cov_pose: covariance of the pose that all pieces share. Shape `[3, 3]`.
-      prior: whether the target's own covariance counts, or it is only one of the pieces.
+      target: the line (of length 1) where the equations are linearised.
+      pieces: what was seen of it, with all of the pose error in the persisting part.
+      share: how much of that may persist.
       thresholds: for the gates, which yield the residuals.
 
     Returns:
-      Offset, angle and covariance, at the target's anchor.
+      What to add to (offset, angle) of the target, and the error of that.
     """
-    g = gates(pieces.lines, target, thresholds=thresholds)
-    s_all = lever_matrix(g.lever)
-    weight, moment, moment_pose = np.zeros((2, 2)), np.zeros(2), np.zeros((2, 3))
-    for s, sign, residual, cov, jac in zip(s_all, g.sign, g.residual, pieces.cov, pieces.jac_pose, strict=True):
-        gain = s.T @ np.linalg.inv(signed_cov(cov, sign))
-        weight += gain @ s
-        moment += gain @ residual
-        moment_pose += gain @ (jac * np.array([[sign], [1.0]]))
-    m = np.linalg.inv(weight)
-    delta = m @ moment
-    cov = symmetric(m + sandwich(m @ moment_pose, cov_pose))
-    if prior:
-        information = np.linalg.inv(cov)
-        cov = symmetric(np.linalg.inv(np.linalg.inv(target.cov[0]) + information))
-        delta = cov @ information @ delta
-    return float(target.offset[0] + delta[0]), float(wrap(target.angle[0] + delta[1])), cov
+    g = gates(pieces, target, thresholds=thresholds, pose_error="persistent")
+    information, of_pose, vector = np.zeros((2, 2)), np.zeros((2, 3)), np.zeros(2)
+    for i in range(len(pieces.offset)):
+        s, flip = lever_matrix(g.lever[i]), sign_matrix(g.sign[i])
+        weight = s.T @ np.linalg.inv(sandwich(flip, pieces.cov_independent[i]))
+        information += weight @ s
+        of_pose += weight @ flip @ pieces.sqrt_persistent[i]
+        vector += weight @ g.residual[i]
+    c = np.linalg.inv(information)
+    a = c @ of_pose
+    kept = Error(symmetric(c + (1 - share) * squared(a)), math.sqrt(share) * a, int(pieces.times_detected.max()))
+    return c @ vector, kept
 
 
 def seen_extent(anchor: np.ndarray, angle: float, pieces: Lines) -> tuple[np.ndarray, np.ndarray]:
@@ -985,48 +1100,81 @@ def fuse_extent(
     return extent, var
 
 
-def _fuse_into(lines: Lines, slot: int, pieces: Pieces, cov_pose: np.ndarray, *, thresholds: Any, rules: Any) -> None:
+def _write(lines: Lines, slot: int, delta: np.ndarray, error: Error) -> None:
+    """Move a line by (offset, angle), and note its error."""
+    _put(lines, slot, offset=lines.offset[slot] + delta[0], angle=wrap(lines.angle[slot] + delta[1]))
+    _put(lines, slot, cov_independent=error.c, sqrt_persistent=error.a, times_detected=error.times)
+
+
+def _fuse_into(
+    lines: Lines,
+    slot: int,
+    pieces: Lines,
+    *,
+    thresholds: Any,
+    pose_error: PoseError,
+    share: float,
+    estimate_ends: bool,
+) -> None:
     """Improve the line in a slot by what was seen of it."""
-    offset, angle, cov = fuse(lines.take(slot), pieces, cov_pose, prior=True, thresholds=thresholds)
-    seen, var_seen = seen_extent(lines.anchor[slot], angle, pieces.lines)
+    delta, seen = observe(lines.take(slot), pieces, share=share, thresholds=thresholds)
+    gain, error = combine(_error_of(lines, slot), seen, pose_error)
+    _write(lines, slot, gain @ delta, error)
+    outermost, var_outermost = seen_extent(lines.anchor[slot], lines.angle[slot], pieces)
     extent, var_extent = fuse_extent(
         lines.extent[slot],
         lines.var_extent[slot],
-        seen,
-        var_seen,
-        estimate=rules.estimate_ends,
+        outermost,
+        var_outermost,
+        estimate=estimate_ends,
         sigmas=float(thresholds.end_sigmas),
     )
-    _put(lines, slot, offset=offset, angle=angle, cov=cov, extent=extent, var_extent=var_extent)
-    lines.times_detected[slot] += 1
+    _put(lines, slot, extent=extent, var_extent=var_extent)
 
 
-def _add(lines: Lines, slot: int, pieces: Pieces, cov: np.ndarray, cov_pose: np.ndarray, *, thresholds: Any) -> None:
-    """Put a new line into a free slot; its first piece is the root, which has the covariance `cov`."""
-    root = dataclasses.replace(pieces.lines.take(0), cov=cov[None])
-    offset, angle, cov = fuse(root, pieces, cov_pose, prior=False, thresholds=thresholds)
-    extent, var_extent = seen_extent(root.anchor[0], angle, pieces.lines)
-    _put(lines, slot, anchor=root.anchor[0], offset=offset, angle=angle, cov=cov, extent=extent, var_extent=var_extent)
-    _put(lines, slot, times_detected=1, valid=True)
+def _add(lines: Lines, slot: int, pieces: Lines, *, share: float, thresholds: Any) -> None:
+    """Put a new line into a free slot; the first of its pieces is the root."""
+    root = pieces.take(0)
+    delta, error = observe(root, pieces, share=share, thresholds=thresholds)
+    _put(lines, slot, anchor=root.anchor[0], offset=root.offset[0], angle=root.angle[0], valid=True)
+    _write(lines, slot, delta, error)
+    extent, var_extent = seen_extent(root.anchor[0], lines.angle[slot], pieces)
+    _put(lines, slot, extent=extent, var_extent=var_extent)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Merging
 
 
-def _merge(lines: Lines, targets: np.ndarray, *, thresholds: Any, ties: Margin) -> dict[int, int]:
-    """Join lines of the map that this scan has shown to be one. Returns the freed slots and where each went."""
+def _merge(
+    lines: Lines, targets: np.ndarray, pairs: list[Gates], *, thresholds: Any, pose_error: PoseError, ties: Margin
+) -> dict[int, int]:
+    """Join lines of the map that this scan has shown to be one.
+
+    Args:
+      lines: lines of the map.
+      targets: for each new line the slot of the line that it is part of, -1 for none. Shape `[n]`.
+      pairs: the new lines against each other: what the scan has seen side by side is not joined.
+      thresholds: the gates.
+      pose_error: what is known of the persisting parts.
+      ties: notes how clear the choices were.
+
+    Returns:
+      The freed slots and where each went.
+    """
     candidates: list[tuple[float, int, int, int]] = []  # NIS, new line, lower slot, higher slot
     for i, g in enumerate(targets):
-        others = np.flatnonzero(lines.valid)
-        others = others[others != g]
-        if g < 0 or g in targets[:i] or not len(others):
+        if g < 0 or g in targets[:i]:
             continue
-        pairs = gates(lines.take(int(g)), lines.take(others), thresholds=thresholds)
-        best = closest(pairs, pairs.geometric & (pairs.gap < 0), ties)
-        if best is not None and pairs.statistical[best]:
+        beside = {int(k) for k, collinear in zip(targets, pairs[i].collinear, strict=True) if not collinear}
+        others = np.array([k for k in np.flatnonzero(lines.valid).tolist() if k != g and k not in beside], int)
+        if not len(others):
+            continue
+        against = gates(lines.take(int(g)), lines.take(others), thresholds=thresholds, pose_error=pose_error)
+        best = closest(against, against.geometric & (against.gap < 0), ties)
+        if best is not None and against.statistical[best]:
             other = int(others[best])
-            candidates.append((float(pairs.nis[best]), i, min(int(g), other), max(int(g), other)))
+            candidates.append((float(against.nis[best]), i, min(int(g), other), max(int(g), other)))
 
     freed: dict[int, int] = {}
     for candidate in candidates:
@@ -1035,12 +1183,10 @@ def _merge(lines: Lines, targets: np.ndarray, *, thresholds: Any, ties: Margin) 
         if all(candidate[:2] <= c[:2] for c in candidates if {low, high} & set(c[2:])):
             freed[high] = low
     for high, low in freed.items():
-        piece = Pieces(lines.take(high), lines.cov[[high]], np.zeros((1, 2, 3)))
-        offset, angle, cov = fuse(lines.take(low), piece, np.zeros((3, 3)), prior=True, thresholds=thresholds)
-        seen, var_seen = seen_extent(lines.anchor[low], angle, piece.lines)
-        extent, var = fuse_extent(lines.extent[low], lines.var_extent[low], seen, var_seen, estimate=False, sigmas=0.0)
-        _put(lines, low, offset=offset, angle=angle, cov=cov, extent=extent, var_extent=var)
-        lines.times_detected[low] = max(lines.times_detected[low], lines.times_detected[high])
+        times = max(lines.times_detected[low], lines.times_detected[high])
+        options = {"thresholds": thresholds, "pose_error": pose_error}
+        _fuse_into(lines, low, lines.take(high), **options, share=1.0, estimate_ends=False)
+        _put(lines, low, times_detected=times)
         _free(lines, high)
     return freed
 
@@ -1183,7 +1329,8 @@ def _piece(line: Lines, a: float, b: float) -> dict[str, Any]:
         "anchor": anchor,
         "offset": line.offset[0] + normal @ shift,
         "angle": line.angle[0],
-        "cov": symmetric(sandwich(lever_matrix(tangent @ shift), line.cov[0])),
+        "cov_independent": symmetric(sandwich(lever_matrix(tangent @ shift), line.cov_independent[0])),
+        "sqrt_persistent": lever_matrix(tangent @ shift) @ line.sqrt_persistent[0],
         "extent": np.array([a, b]) + tangent @ shift,
         "var_extent": line.var_extent[0],
         "times_detected": line.times_detected[0],
@@ -1200,7 +1347,9 @@ def _circle_state(circles: Circles, i: int) -> np.ndarray:
     return np.array([*circles.center[i], circles.radius[i]])
 
 
-def match_circle(circles: Circles, found: Circles, i: int, *, thresholds: Any, rules: Any) -> tuple[Match, float]:
+def match_circle(
+    circles: Circles, found: Circles, i: int, *, thresholds: Any, rules: Any, pose_error: PoseError
+) -> tuple[Match, float]:
     """The circle of the map that new circle `i` is, s5.2.1, and how far apart their centres are.
 
     `suspect` is the nearest circle where the distance would do, but the covariances forbid it.
@@ -1213,7 +1362,9 @@ def match_circle(circles: Circles, found: Circles, i: int, *, thresholds: Any, r
     if not (found.fitted[i] and circles.fitted[j]):
         return Match(j, -1, 0.0, 0), float(distance[j])
     d = _circle_state(found, i) - _circle_state(circles, j)
-    nis = float(d @ np.linalg.solve(found.cov[i] + circles.cov[j], d))
+    cov = found.cov_independent[i] + circles.cov_independent[j]
+    cov += cov_shared(found.sqrt_persistent[i], circles.sqrt_persistent[j], pose_error)
+    nis = float(d @ np.linalg.solve(cov, d))
     if rules.weigh_circles and not nis < t.circle_match_nis:
         return Match(-1, j, nis, 3), math.inf
     return Match(j, -1, nis, 3), float(distance[j])
@@ -1241,24 +1392,25 @@ def _inside(point: np.ndarray, triangle: np.ndarray) -> bool:
     return all(perp(triangle[(k + 1) % 3] - triangle[k]) @ (point - triangle[k]) > 0 for k in range(3))
 
 
-def _fuse_circle(circles: Circles, slot: int, found: Circles, members: list[int], *, rules: Any) -> None:
+def _fuse_circle(
+    circles: Circles, slot: int, found: Circles, members: list[int], *, rules: Any, pose_error: PoseError
+) -> None:
     """Improve a circle by the new ones that are it; `members` are in order of distance. Eqs. (24)-(25) or better."""
     old = _circle_state(circles, slot)
     mean = np.mean([_circle_state(found, i) for i in members], axis=0)
     fitted = [i for i in members if found.fitted[i]]
-    state, cov, is_fitted = old, circles.cov[slot], bool(circles.fitted[slot])
+    state, error, is_fitted = old, _error_of(circles, slot), bool(circles.fitted[slot])
     if not rules.weigh_circles:
         state = (mean + old) / 2
     elif fitted and is_fitted:
-        new = fitted[0]
-        prior, information = np.linalg.inv(cov), np.linalg.inv(found.cov[new])
-        cov = symmetric(np.linalg.inv(prior + information))
-        state = old + cov @ information @ (_circle_state(found, new) - old)
+        gain, error = combine(error, _error_of(found, fitted[0]), pose_error)
+        state = old + gain @ (_circle_state(found, fitted[0]) - old)
     elif fitted:
-        state, cov, is_fitted = _circle_state(found, fitted[0]), found.cov[fitted[0]], True
+        state, error, is_fitted = _circle_state(found, fitted[0]), _error_of(found, fitted[0]), True
     elif not is_fitted:
         state = old + (mean - old) / (circles.times_detected[slot] + 1)
-    _put(circles, slot, center=state[:2], radius=state[2], cov=cov, fitted=is_fitted)
+    _put(circles, slot, center=state[:2], radius=state[2], fitted=is_fitted)
+    _put(circles, slot, cov_independent=error.c, sqrt_persistent=error.a)
     circles.times_detected[slot] += 1
 
 
@@ -1272,15 +1424,17 @@ def _update_circles(
     *,
     thresholds: Any,
     rules: Any,
+    pose_error: PoseError,
+    share: float,
 ) -> None:
     """The circles of the scan into the map, after its lines."""
-    lines, circles, new = new_map.lines, new_map.circles, found.circles
+    lines, circles, new = new_map.lines, new_map.circles, forget(found.circles, share)
     reach = float(thresholds.circle_line_distance)
 
     members: dict[int, list[tuple[float, int]]] = {}
     added = []
     for i in range(len(new.radius)):
-        match, distance = match_circle(circles, new, i, thresholds=thresholds, rules=rules)
+        match, distance = match_circle(circles, new, i, thresholds=thresholds, rules=rules, pose_error=pose_error)
         report.circle_nis[i], report.circle_dof[i] = match.nis, match.dof
         if match.slot >= 0:
             report.circle_slot[i] = match.slot
@@ -1301,7 +1455,7 @@ def _update_circles(
             report.deleted += 1
 
     for slot, assigned in members.items():
-        _fuse_circle(circles, slot, new, [i for _, i in sorted(assigned)], rules=rules)
+        _fuse_circle(circles, slot, new, [i for _, i in sorted(assigned)], rules=rules, pose_error=pose_error)
         report.fused += 1
 
     on_map = lines.take(np.flatnonzero(lines.valid))
@@ -1312,7 +1466,7 @@ def _update_circles(
         if slot is None:
             report.status |= Status.MAP_CIRCLES_FULL
             continue
-        fields = ("center", "radius", "cov", "fitted")
+        fields = ("center", "radius", "cov_independent", "sqrt_persistent", "fitted")
         _put(circles, slot, times_detected=1, valid=True, **{name: getattr(new, name)[i] for name in fields})
         report.circle_slot[i] = NEW
         report.added += 1
@@ -1341,6 +1495,8 @@ def update(
     rules: Any,
     covariance: Literal["exact", "printed"],
     scan_capacity: Any,
+    pose_error: PoseError = "unknown",
+    persistence: Any = None,
     mode: Literal["simultaneous", "sequential"] = "simultaneous",
 ) -> tuple[OracleMap, Report]:
     """One scan into the map.
@@ -1356,6 +1512,8 @@ def update(
       rules: a `settings.Rules`.
       covariance: `exact`, or Eq. (12) as `printed`.
       scan_capacity: a `settings.Capacity`: how much of one scan is kept.
+      pose_error: what is known of how the errors of the poses of several scans hang together.
+      persistence: a `settings.Persistence`, for `persistent`.
       mode: `simultaneous`: all lines of the scan are held against the map as it stood. `sequential`, the order of the
         paper: line by line, each against what the one before has left.
 
@@ -1388,14 +1546,34 @@ def update(
         return new_map, report
     sweep = sweep_of(*scan, pose_mean, pose_cov, noise=noise, mount=mount)
     apex = sweep.p + sweep.laser
+    share = {"independent": 0.0, "unknown": 1.0}.get(pose_error)
+    if share is None:
+        share = float(persistence.share)
+        if len(sweep.r):
+            drifted = float(persistence.correlation) ** 2
+            new_map = OracleMap(lines=forget(new_map.lines, drifted), circles=forget(new_map.circles, drifted))
     lines = new_map.lines
+    if not rules.share_pose:
+        found = dataclasses.replace(found, lines=forget(found.lines, 0.0))
+    pairs = pairs_of(found.lines, thresholds=thresholds)
 
     into = _lines_one_by_one if mode == "sequential" else _lines_at_once
     ties = Margin()
-    targets, suspects, triangles = into(lines, found, sweep, report, thresholds=thresholds, rules=rules, ties=ties)
+    targets, suspects, triangles = into(
+        lines,
+        found,
+        pairs,
+        apex,
+        report,
+        thresholds=thresholds,
+        rules=rules,
+        pose_error=pose_error,
+        share=share,
+        ties=ties,
+    )
 
     if rules.merge:
-        freed = _merge(lines, targets, thresholds=thresholds, ties=ties)
+        freed = _merge(lines, targets, pairs, thresholds=thresholds, pose_error=pose_error, ties=ties)
         report.merged += len(freed)
         for slots in (targets, suspects, report.line_slot):
             slots[:] = [freed.get(slot, slot) for slot in slots.tolist()]
@@ -1414,27 +1592,54 @@ def update(
                 cuts.setdefault(j, []).extend(intervals)
         _cut(lines, cuts, report, thresholds=thresholds)
 
-    _update_circles(new_map, found, sweep, targets, triangles, report, thresholds=thresholds, rules=rules)
+    _update_circles(
+        new_map,
+        found,
+        sweep,
+        targets,
+        triangles,
+        report,
+        thresholds=thresholds,
+        rules=rules,
+        pose_error=pose_error,
+        share=share,
+    )
     report.status = int(report.status)
     report.tie_margin = ties.smallest
     return new_map, report
 
 
 def _lines_at_once(
-    lines: Lines, found: Extraction, sweep: Sweep, report: Report, *, thresholds: Any, rules: Any, ties: Margin
+    lines: Lines,
+    found: Extraction,
+    pairs: list[Gates],
+    apex: np.ndarray,
+    report: Report,
+    *,
+    thresholds: Any,
+    rules: Any,
+    pose_error: PoseError,
+    share: float,
+    ties: Margin,
 ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
-    """Match all new lines against the map as it stood, then fuse and add.
+    """Match all new lines against the map as it stood, then fuse and add. `apex` is for the other order.
 
     Returns:
       For each new line the slot that it went into and the slot that it was suspected to be (-1: none), and no
       triangles: they are drawn later.
     """
+    del apex
     n = len(found.lines.offset)
+    new, slots = forget(found.lines, share), np.flatnonzero(lines.valid)
+    matching = {"thresholds": thresholds, "pose_error": pose_error, "ties": ties}
+    matches = [match_line(new.take(i), lines, slots, **matching) for i in range(n)]
+    if rules.share_pose:
+        matches = part(matches, pairs)
+
     targets, suspects = np.full(n, -1), np.full(n, -1)
     pieces: dict[int, list[int]] = {}
     unmatched = []
-    for i in range(n):
-        match = match_line(found.lines.take(i), lines, thresholds=thresholds, ties=ties)
+    for i, match in enumerate(matches):
         report.line_nis[i], report.line_dof[i] = match.nis, match.dof
         if match.slot >= 0:
             targets[i] = report.line_slot[i] = match.slot
@@ -1444,41 +1649,64 @@ def _lines_at_once(
         else:
             unmatched.append(i)
 
-    groups = group_new(found, unmatched, thresholds=thresholds, rules=rules, ties=ties)
+    groups = group_new(pairs, unmatched, ties)
     for slot, index in pieces.items():
-        seen = pieces_of(found, index, rules=rules)
-        _fuse_into(lines, slot, seen, sweep.cov_pose, thresholds=thresholds, rules=rules)
+        options = {"pose_error": pose_error, "share": share, "estimate_ends": rules.estimate_ends}
+        _fuse_into(lines, slot, found.lines.take(index), thresholds=thresholds, **options)
         report.fused += 1
-    for root, index in groups.items():
+    for index in groups.values():
         slot = _lowest_free(lines)
         if slot is None:
             report.status |= Status.MAP_LINES_FULL
             continue
-        seen = pieces_of(found, index, rules=rules)
-        _add(lines, slot, seen, found.lines.cov[root], sweep.cov_pose, thresholds=thresholds)
+        _add(lines, slot, found.lines.take(index), share=share, thresholds=thresholds)
         targets[index], report.line_slot[index] = slot, NEW
         report.added += 1
     return targets, suspects, []
 
 
 def _lines_one_by_one(
-    lines: Lines, found: Extraction, sweep: Sweep, report: Report, *, thresholds: Any, rules: Any, ties: Margin
+    lines: Lines,
+    found: Extraction,
+    pairs: list[Gates],
+    apex: np.ndarray,
+    report: Report,
+    *,
+    thresholds: Any,
+    rules: Any,
+    pose_error: PoseError,
+    share: float,
+    ties: Margin,
 ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
     """The order of the paper: each new line is matched, fused or added, and wipes, before the next one.
+
+    With `share_pose` a line that the scan has seen beside a line before it is not held against what that one went into.
+    A line of the map that rests on this scan alone has its pose error: there nothing is unknown.
 
     Returns:
       For each new line the slot that it went into and the slot that it was suspected to be (-1: none, or that line is
       gone again), and the triangles that have wiped.
     """
     n = len(found.lines.offset)
+    new = forget(found.lines, share)
     targets, suspects = np.full(n, -1), np.full(n, -1)
     triangles: list[np.ndarray] = []
+    added: set[int] = set()
+    known: PoseError = "persistent" if pose_error == "unknown" else pose_error
     for i in range(n):
-        match = match_line(found.lines.take(i), lines, thresholds=thresholds, ties=ties)
+        beside = {int(k) for k, c in zip(targets, pairs[i].collinear, strict=True) if not c and rules.share_pose}
+        slots = [k for k in np.flatnonzero(lines.valid).tolist() if k not in beside]
+        of_map, of_scan = (np.array([k for k in slots if (k in added) == fresh], int) for fresh in (False, True))
+        matching = {"thresholds": thresholds, "ties": ties}
+        match = match_line(new.take(i), lines, of_map, pose_error=pose_error, **matching)
+        other = match_line(new.take(i), lines, of_scan, pose_error=known, **matching)
+        if other.dof and (not match.dof or other.nis < match.nis):
+            match = other
         report.line_nis[i], report.line_dof[i] = match.nis, match.dof
-        seen = pieces_of(found, [i], rules=rules)
         if match.slot >= 0:
-            _fuse_into(lines, match.slot, seen, sweep.cov_pose, thresholds=thresholds, rules=rules)
+            error_model = known if match.slot in added else pose_error
+            options = {"pose_error": error_model, "share": share, "estimate_ends": rules.estimate_ends}
+            _fuse_into(lines, match.slot, found.lines.take(i), thresholds=thresholds, **options)
             targets[i] = report.line_slot[i] = match.slot
             report.fused += 1
         elif match.suspect >= 0 and rules.leave_out_ambiguous:
@@ -1489,12 +1717,13 @@ def _lines_one_by_one(
             if slot is None:
                 report.status |= Status.MAP_LINES_FULL
                 continue
-            _add(lines, slot, seen, found.lines.cov[i], sweep.cov_pose, thresholds=thresholds)
+            _add(lines, slot, found.lines.take(i), share=share, thresholds=thresholds)
+            added.add(slot)
             targets[i], report.line_slot[i] = slot, NEW
             report.added += 1
         if rules.wipe_by_beams:
             continue
-        triangle = wipe_triangle(lines.take(targets[i]), sweep.p + sweep.laser, thresholds=thresholds)
+        triangle = wipe_triangle(lines.take(targets[i]), apex, thresholds=thresholds)
         if triangle is None:
             continue
         triangles.append(triangle)
@@ -1503,4 +1732,5 @@ def _lines_one_by_one(
             # Its slot may go to another line, which these new lines never were.
             targets[targets == slot] = -1
             suspects[suspects == slot] = -1
+            added.discard(slot)
     return targets, suspects, triangles

@@ -12,6 +12,8 @@ from real_logs import LOGS, one, scans_of
 
 from linemap_jax import Capacity, Mount, SensorNoise, empty_map, extract, preset, update
 from linemap_jax.core.frames import reanchor
+from linemap_jax.core.settings import Persistence
+from linemap_jax.core.state import LEFT_OUT
 
 SCAN = Capacity(64, 96)
 MAP = Capacity(512, 512)
@@ -42,12 +44,17 @@ def seen_from(anchor: np.ndarray, lines: Any, keep: np.ndarray) -> Any:
 
 
 def line_differences(mine: Any, theirs: Any, keep: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Difference of (offset, angle) and relative difference of the covariance (Frobenius), at the oracle's anchors."""
+    """Differences at the oracle's anchors: of (offset, angle), and of both parts of the covariance, shape `[2, K]`.
+
+    Those of the covariance are relative to the whole of it (Frobenius).
+    """
     moved = jax.tree.map(np.asarray, seen_from(theirs.anchor, mine, keep))
     turn = np.abs((moved.angle - theirs.angle + np.pi) % (2 * np.pi) - np.pi)
     estimate = np.maximum(np.abs(moved.offset - theirs.offset), turn)
-    cov = np.linalg.norm(moved.cov - theirs.cov, axis=(1, 2)) / np.linalg.norm(theirs.cov, axis=(1, 2))
-    return estimate, cov
+    independent = moved.cov_independent - theirs.cov_independent
+    persistent = oracle.squared(moved.sqrt_persistent) - oracle.squared(theirs.sqrt_persistent)
+    scale = np.linalg.norm(theirs.cov, axis=(1, 2))
+    return estimate, np.stack([np.linalg.norm(part, axis=(1, 2)) / scale for part in (independent, persistent)])
 
 
 @pytest.mark.parametrize("name", ["default", "paper"])
@@ -83,7 +90,8 @@ def test_extraction_is_that_of_the_oracle(log: str, name: str) -> None:
         np.testing.assert_array_equal(mine.circles.fitted[kept], theirs.circles.fitted)
         np.testing.assert_allclose(mine.circles.center[kept], theirs.circles.center, atol=1e-8)
         np.testing.assert_allclose(mine.circles.radius[kept], theirs.circles.radius, atol=1e-8)
-        np.testing.assert_allclose(mine.circles.cov[kept], theirs.circles.cov, atol=1e-8)
+        np.testing.assert_allclose(mine.circles.cov_independent[kept], theirs.circles.cov_independent, atol=1e-8)
+        np.testing.assert_allclose(mine.circles.sqrt_persistent[kept], theirs.circles.sqrt_persistent, atol=1e-8)
 
 
 @pytest.mark.parametrize("log", LOGS)
@@ -111,35 +119,52 @@ def test_float32_extraction_is_that_of_the_oracle(log: str) -> None:
     assert same >= 0.99 * total
 
 
-@partial(jax.jit, static_argnames="name")
-def update_all(line_map: Any, scans: Any, poses: Any, name: str) -> Any:
+PERSISTENCE = Persistence(share=0.7, correlation=0.95)
+
+
+# As in `build`: these options compile in half the time.
+@partial(jax.jit, static_argnames=("name", "pose_error"), compiler_options={"xla_cpu_use_fusion_emitters": False})
+def update_all(line_map: Any, scans: Any, poses: Any, name: str, pose_error: str) -> Any:
     """The map after each scan, and the reports."""
+    options = preset(name) | {"pose_error": pose_error, "persistence": PERSISTENCE}
 
     def step(line_map: Any, x: Any) -> Any:
-        line_map, report = update(line_map, *x, capacity=SCAN, **preset(name))
+        line_map, report = update(line_map, *x, capacity=SCAN, **options)
         return line_map, (line_map, report)
 
     return jax.lax.scan(step, line_map, (scans, poses))[1]
 
 
-@pytest.mark.parametrize("name", ["default", "paper"])
-@pytest.mark.parametrize("log", ["intel", "freiburg-079"])
-def test_map_is_that_of_the_oracle_slot_by_slot(log: str, name: str) -> None:
-    scans, poses = scans_of(log, slice(200))
-    maps, reports = jax.tree.map(np.asarray, update_all(empty_map(MAP, np.float64), scans, poses, name))
-    options = oracle_options(preset(name))
+@pytest.mark.parametrize(
+    ("log", "name", "pose_error", "count"),
+    [
+        ("intel", "default", "unknown", 200),
+        ("intel", "paper", "unknown", 200),
+        ("freiburg-079", "default", "unknown", 200),
+        ("freiburg-079", "paper", "unknown", 200),
+        ("intel", "default", "independent", 60),
+        ("intel", "default", "persistent", 60),
+    ],
+)
+def test_map_is_that_of_the_oracle_slot_by_slot(log: str, name: str, pose_error: str, count: int) -> None:
+    scans, poses = scans_of(log, slice(count))
+    maps, reports = jax.tree.map(np.asarray, update_all(empty_map(MAP, np.float64), scans, poses, name, pose_error))
+    options = oracle_options(preset(name)) | {"pose_error": pose_error, "persistence": PERSISTENCE}
     theirs = oracle.empty_map(MAP)
-    for t in range(200):
+    for t in range(count):
         scan, pose = one(scans, t), one(poses, t)
         theirs, report = oracle.update(theirs, fields(scan), pose.mean, pose.cov, scan_capacity=SCAN, **options)
         mine, said = one(maps, t), one(reports, t)
-        for count in ("added", "fused", "merged", "trimmed", "split", "deleted", "status"):
-            assert getattr(said, count) == getattr(report, count), f"{count}, scan {t}"
-        lines = int(np.sum(said.line_dof.shape[0]))
-        assert lines == SCAN.lines
-        n = len(report.line_slot)
+        for name_of_count in ("added", "fused", "merged", "trimmed", "split", "deleted", "status"):
+            assert getattr(said, name_of_count) == getattr(report, name_of_count), f"{name_of_count}, scan {t}"
+        n, m = len(report.line_slot), len(report.circle_slot)
         np.testing.assert_array_equal(said.line_slot[:n], report.line_slot, err_msg=f"scan {t}")
+        np.testing.assert_array_equal(said.line_dof[:n], report.line_dof, err_msg=f"scan {t}")
         np.testing.assert_allclose(said.line_nis[:n], report.line_nis, rtol=1e-4, atol=1e-6)
+        # Circles of a scan may have free slots between them.
+        places = np.flatnonzero(said.circle_slot != LEFT_OUT)
+        np.testing.assert_array_equal(said.circle_slot[places], report.circle_slot[report.circle_slot != LEFT_OUT])
+        assert m >= len(places)
         np.testing.assert_array_equal(mine.lines.valid, theirs.lines.valid)
         np.testing.assert_array_equal(mine.circles.valid, theirs.circles.valid)
     keep = theirs.lines.valid
@@ -151,4 +176,6 @@ def test_map_is_that_of_the_oracle_slot_by_slot(log: str, name: str) -> None:
     kept = theirs.circles.valid
     np.testing.assert_allclose(mine.circles.center[kept], theirs.circles.center[kept], atol=1e-7)
     np.testing.assert_allclose(mine.circles.radius[kept], theirs.circles.radius[kept], atol=1e-7)
+    np.testing.assert_allclose(mine.circles.cov[kept], theirs.circles.cov[kept], atol=1e-8)
     np.testing.assert_array_equal(mine.circles.fitted[kept], theirs.circles.fitted[kept])
+    np.testing.assert_array_equal(mine.circles.times_detected[kept], theirs.circles.times_detected[kept])
