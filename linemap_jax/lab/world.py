@@ -7,6 +7,7 @@ another one that appears. Units are metres and radians; times are scan indices.
 
 import dataclasses
 import enum
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -114,8 +115,8 @@ def box(
     width: Number,
     depth: Number,
     angle: Number = 0.0,
-    kind: Kind = Kind.OBSTACLE,
     *,
+    kind: Kind = Kind.OBSTACLE,
     appears: Time = 0,
     vanishes: Time = NEVER,
 ) -> World:
@@ -231,3 +232,14 @@ def pad(world: World, *, segments: int, poles: int, path: int) -> World:
         poles=jax.tree.map(longer(more[1]), world.poles),
         path=jnp.pad(world.path, [(0, more[2]), (0, 0)], mode="edge") if path else world.path,
     )
+
+
+def world_from_arrays(arrays: Mapping[str, Any]) -> World:
+    """A world from the arrays of its fields, such as `linemap_jax.io.worlds.read_world` gives them."""
+    fields = jax.tree.map(jnp.asarray, dict(arrays))
+    return World(segments=Segments(**fields["segments"]), poles=Poles(**fields["poles"]), path=fields["path"])
+
+
+def arrays_from_world(world: World) -> dict[str, Any]:
+    """The arrays of a world, by field: the inverse of `world_from_arrays`, on the host."""
+    return jax.tree.map(np.asarray, dataclasses.asdict(world))
