@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from linemap_jax.core import circles as circles_
-from linemap_jax.core.lines import MIN_POINTS, length_of_run, measure_lines
+from linemap_jax.core.lines import MIN_POINTS, length_of_run, measure_lines, without_corner_points
 from linemap_jax.core.runs import select_runs
 from linemap_jax.core.segmentation import incremental
 from linemap_jax.core.segmentation.incremental import Run
@@ -116,8 +116,9 @@ def extract_points(
     few = run.n < MIN_POINTS
     short = length_of_run(run, points.position) <= thresholds.min_length
     runs, lines_full = select_runs(run.n, ends & ~few & ~short, capacity.lines)
+    own = without_corner_points(points, runs, noise) if rules.leave_out_corners else runs
     lines, jac_line_pose, cov_measurement = measure_lines(
-        points, pose, runs, noise, covariance=covariance, jacobians=jacobians
+        points, pose, own, noise, covariance=covariance, jacobians=jacobians
     )
 
     cluster_ends, cluster = circles_.cluster(points, points.valid & (runs.of_point < 0), thresholds)

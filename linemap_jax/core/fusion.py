@@ -21,6 +21,11 @@ from linemap_jax.core.slots import choose, least, take
 from linemap_jax.core.state import Circles, Lines, pytree, squared
 
 
+JACOBIAN_ERROR = 0.01
+"""How well A is known, relative to its size: Jacobians are taken at an estimated pose, which is half a degree off. A
+gain that lets an error that persists cancel between two viewpoints would believe in A to the last digit."""
+
+
 @pytree
 class Errors:
     """The error of an estimate of n numbers, in the two parts of `Lines` and `Circles`."""
@@ -42,7 +47,7 @@ def combine(old: Errors, new: Errors, pose_error: PoseError) -> tuple[Float[Arra
     "independent" and "persistent": both errors hold the same u (if there is any), and their parts add up as
     (I - K) A_old + K A_new. With D = A_new - A_old the best gain is
     K = (C_old - A_old D^T) (C_old + C_new + D D^T)^-1, that of a Schmidt-Kalman filter, which considers u but does not
-    estimate it. Where nothing persists, that is Eq. (23).
+    estimate it. Where nothing persists, that is Eq. (23). C_new holds `JACOBIAN_ERROR` too.
 
     "unknown": any correlation is possible. For each w in (0, 1) the persisting part is bounded by
     (I - K) A_old A_old^T (I - K)^T / w + K A_new A_new^T K^T / (1 - w), split covariance intersection (Julier and
@@ -59,6 +64,8 @@ def combine(old: Errors, new: Errors, pose_error: PoseError) -> tuple[Float[Arra
     """
     c_old, a_old = old.cov_independent, old.sqrt_persistent
     c_new, a_new = new.cov_independent, new.sqrt_persistent
+    if pose_error == "persistent":
+        c_new = c_new + JACOBIAN_ERROR**2 * squared(a_new)
     times = old.times_detected + new.times_detected
     if pose_error == "unknown":
         w = (old.times_detected / times).astype(c_old.dtype)[..., None, None]
@@ -212,9 +219,7 @@ def _fuse_ends(
     return dataclasses.replace(model, extent=extent, var_extent=var_extent)
 
 
-def fuse_circles(
-    model: Circles, new: Circles, matches: CircleMatches, rules: Rules, pose_error: PoseError
-) -> Circles:
+def fuse_circles(model: Circles, new: Circles, matches: CircleMatches, rules: Rules, pose_error: PoseError) -> Circles:
     """A better estimate of the map's circles from the new ones that match them: section 5.2.2.
 
     `weigh_circles` false: Eqs. (24)-(25), the mean of old and new; the print of (24) repeats y_cn where it means y_cm.

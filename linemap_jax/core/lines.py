@@ -8,6 +8,8 @@ Every point belongs to one run, so that the Jacobians of all lines of a scan fol
 sum of all offsets, one of the sum of all angles.
 """
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -23,6 +25,8 @@ from linemap_jax.core.state import Lines, Pose, pytree
 
 MIN_POINTS = 3
 """At least three points are necessary to define a line (s4.3.1)."""
+CORNER_SIGMAS = 3.0
+"""Points of a run that are closer than this to the line beside it may be that line's."""
 
 
 @pytree
@@ -236,6 +240,42 @@ def line_extent(
     """Section 4.2.4: the first and the last point of each run, projected on its line; metres from the anchor."""
     tangent = jnp.stack([-jnp.sin(angle), jnp.cos(angle)], -1)
     return jnp.stack([dot(tangent, position[i] - anchor) for i in (runs.first, runs.last)], -1)
+
+
+def without_corner_points(points: Points, runs: Runs, noise: SensorNoise) -> Runs:
+    """The runs without the points at their ends that may belong to the line beside them.
+
+    Just past a corner, points of the next wall still pass criterion 2. At an end of a run, a point that lies within
+    `CORNER_SIGMAS` of the line next to it in the sweep is left out of the fit, with all points beyond it; unless these
+    are many, as where two pieces of one wall follow each other.
+
+    Args:
+      points: the points of the scan.
+      runs: the runs that are lines, in the order of the sweep.
+      noise: of the sensor.
+    """
+    fit = regress(points.position, runs)
+    length2 = jnp.maximum(dot(fit.direction, fit.direction), 1)
+    normal, middle = perp(fit.direction) / jnp.sqrt(length2)[:, None], fit.origin + fit.centroid
+    index = jnp.arange(runs.of_point.shape[0])
+    count = runs.valid.shape[0]
+    kept = runs.of_point >= 0
+    for side in (-1, 1):
+        # The line beside each run, in front of its first point or behind its last one
+        beside = jnp.clip(jnp.arange(count) + side, 0, count - 1)
+        exists = runs.valid & runs.valid[beside] & (beside != jnp.arange(count))
+        there = runs.spread(jnp.concatenate([normal[beside], middle[beside]], -1))
+        across = dot(there[:, :2], points.position - there[:, 2:])
+        along_beam = dot(there[:, :2], points.beam) ** 2
+        variance = noise.range_sigma**2 * along_beam + (points.range * noise.bearing_sigma) ** 2 * (1 - along_beam)
+        far = across**2 > CORNER_SIGMAS**2 * variance
+        # The outermost point that is surely the run's own
+        mine = (runs.of_point[None] == jnp.arange(count)[:, None]) & far[None]
+        outermost = jnp.max(jnp.where(mine, side * index[None], -index.shape[0]), -1)
+        last = jnp.where(side > 0, runs.last, -runs.first)
+        trims = exists & (last - outermost <= fit.count / 3)
+        kept = kept & ~(trims[runs.of_point] & (side * index > outermost[runs.of_point]))
+    return dataclasses.replace(runs, of_point=jnp.where(kept, runs.of_point, -1))
 
 
 def length_of_run(run: Run, position: Float[Array, "N 2"]) -> Float[Array, " N"]:

@@ -100,7 +100,7 @@ def update(
     if line_map.lines.offset.dtype != dtype:
         raise ValueError(f"the map is {line_map.lines.offset.dtype} and the scan {dtype}; make both the same")
     thresholds, noise, mount = with_defaults(thresholds, noise, mount, dtype)
-    persistence = as_dtype(persistence_of(pose_error, persistence), dtype)
+    lasting = as_dtype(persistence_of(pose_error, persistence), dtype)
     pose = as_dtype(pose, dtype)
     scan, pose, finite = usable(scan, pose)
     points = points_from_scan(scan, pose, mount, jacobians=jacobians)
@@ -118,15 +118,25 @@ def update(
 
     if pose_error == "persistent":
         # A scan without returns is none, so that a chunk may be filled up with such.
-        correlation = jnp.where(jnp.any(scan.valid), persistence.correlation, 1)
+        correlation = jnp.where(jnp.any(scan.valid), lasting.correlation, 1)
         line_map = dataclasses.replace(
             line_map,
             lines=fusion.forget(line_map.lines, correlation**2),
             circles=fusion.forget(line_map.circles, correlation**2),
         )
-    lines = _update_lines(line_map.lines, found, thresholds, rules, pose_error, persistence.share)
+    lines = _update_lines(line_map.lines, found, thresholds, rules, pose_error, lasting.share)
     swept = _sweep(line_map.circles, lines, found, points, pose, thresholds, noise, rules)
-    circles = _update_circles(line_map.circles, found, swept.lines, lines.targets, swept.gone, thresholds, rules, pose_error, persistence.share)
+    circles = _update_circles(
+        line_map.circles,
+        found,
+        swept.lines,
+        lines.targets,
+        swept.gone,
+        thresholds,
+        rules,
+        pose_error,
+        lasting.share,
+    )
 
     status = found.status | jnp.where(finite, 0, int(Status.POSE_NOT_FINITE))
     status |= jnp.where(lines.overflow | swept.wiped.overflow, int(Status.MAP_LINES_FULL), 0)

@@ -4,8 +4,6 @@ Lines are compared at the anchor of the new line: the mean of the other line is 
 first order. (rho, theta) and (-rho, theta + pi) are one line, and differences of angles are wrapped.
 """
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int

@@ -145,6 +145,8 @@ class Rules:
     give_back_point: bool = True
     """A run that criterion 2 ends gives its last point to the next run: just past a corner, points of the next wall
     still pass the gate, and they spoil the fit."""
+    leave_out_corners: bool = True
+    """Points at the end of a run that may belong to the line beside it take no part in the fit."""
     fit_circles: bool = True
     """Fit a circle to a cluster where there are points enough. Eqs. (18)-(20) describe the visible arc: a centre that
     lies before the pole's and moves with the viewpoint."""

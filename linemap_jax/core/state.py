@@ -252,6 +252,7 @@ def squared(root: Float[Array, "*s n m"]) -> Float[Array, "*s n n"]:
     """A A^T, the matrix of which A is a square root."""
     return jnp.sum(root[..., :, None, :] * root[..., None, :, :], -1)
 
+
 NEW = -1
 """In a `Report`: the primitive was added to the map."""
 LEFT_OUT = -2

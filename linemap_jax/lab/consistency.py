@@ -1,0 +1,333 @@
+"""Whether covariances can be believed: the errors of simulated runs, measured by their own covariances.
+
+The NEES (normalised estimation error squared) e^T C^-1 e of an estimate of n numbers whose covariance is right is
+chi-square with n degrees of freedom: its mean is n, and 95 % of it lies below the 95 % quantile. The NIS is the same of
+an innovation. One line is taken from each run, since the lines of one scan share its pose.
+
+Three experiments, each a function of a key that makes one run; map them over keys:
+
+- `known_points`: the fit alone. The points of a wall are known; nothing is selected.
+- `pipeline`: what `extract` makes of a scan.
+- `fused`: a line of the map after many scans, association known, with pose errors that may persist.
+"""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from statistics import NormalDist
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from linemap_jax.core.extract import extract
+from linemap_jax.core.frames import dot, unit, wrap_angle
+from linemap_jax.core.fusion import forget, fuse_lines
+from linemap_jax.core.lines import MIN_POINTS, measure_lines
+from linemap_jax.core.matching import compare_lines
+from linemap_jax.core.propagation import inverse, quadratic, square_root
+from linemap_jax.core.runs import Runs
+from linemap_jax.core.sensor import points_from_scan
+from linemap_jax.core.settings import (
+    Covariance,
+    Mount,
+    Number,
+    Persistence,
+    PoseError,
+    Rules,
+    SensorNoise,
+    Thresholds,
+    persistence_of,
+)
+from linemap_jax.core.state import Lines, Pose, Scan, empty_lines, pytree
+from linemap_jax.lab.raycast import cast
+from linemap_jax.lab.scanners import Scanner, noise_of, simulate_scan
+from linemap_jax.lab.world import World
+
+CHI2_95 = -2 * math.log(0.05)
+"""95 % quantile of chi-square with 2 degrees of freedom."""
+CHI2_MEDIAN = 2 * math.log(2)
+"""Its median."""
+SEEN_BEAMS = 10
+"""Fewest nominal beams on a wall that an experiment may choose."""
+
+
+@pytree
+class Walls:
+    """Straight walls, the truth that lines are held against."""
+
+    point: Float[Array, "W 2"]  # m, on the wall
+    angle: Float[Array, " W"]  # rad, of the normal
+
+
+def walls_of(world: World) -> Walls:
+    """The segments of a world as boundless lines."""
+    step = world.segments.ends[:, 1] - world.segments.ends[:, 0]
+    return Walls(point=world.segments.ends.mean(1), angle=jnp.arctan2(step[:, 1], step[:, 0]) - jnp.pi / 2)
+
+
+def line_error(lines: Lines, wall: Walls) -> Float[Array, "*s 2"]:
+    """The error of (offset, angle), at the anchor of the line. A line may lie either way round."""
+    turn = wrap_angle(lines.angle - wall.angle)
+    reverse = jnp.abs(turn) > jnp.pi / 2
+    turn = jnp.where(reverse, turn - jnp.sign(turn) * jnp.pi, turn)
+    sign = jnp.where(reverse, -1, 1)
+    offset = lines.offset - sign * dot(unit(wall.angle), wall.point - lines.anchor)
+    return jnp.stack([offset, turn], -1)
+
+
+def nees(error: Float[Array, "*s n"], cov: Float[Array, "*s n n"]) -> Float[Array, "*s"]:
+    """Normalised estimation error squared, e^T C^-1 e, for n of 2 or 3."""
+    return quadratic(error, inverse(cov))
+
+
+class Sample(NamedTuple):
+    """What one run has to say."""
+
+    nees: Array
+    counts: Array  # false where nothing was found
+
+
+def known_points(
+    key: Array, world: World, pose: Float[Array, "3"], scanner: Scanner, cov_pose: Float[Array, "3 3"]
+) -> dict[Covariance, Sample]:
+    """The NEES of a fit to the known points of one wall, with `exact` and with `printed` covariance.
+
+    Of the walls that the scanner sees one is chosen by chance. Its points are the beams whose nominal direction meets
+    it; they are measured on the boundless wall, so that no noise decides which points take part.
+
+    Args:
+      key: of the noise, of the pose's error, and of the choice.
+      world: walls.
+      pose: the true one.
+      scanner: its noise is what the fit believes.
+      cov_pose: of the pose's error.
+    """
+    of_wall, of_scan, of_pose = jax.random.split(key, 3)
+    which, _ = _visible_wall(of_wall, world, pose, scanner)
+    wall = jax.tree.map(lambda x: x[which], walls_of(world))
+    on_wall = cast(world, pose[:2], unit(pose[2] + scanner.bearings)).thing == which
+    scan = _scan_of_wall(of_scan, wall, on_wall, pose, scanner)
+    estimate = Pose(mean=pose + _normal(of_pose, cov_pose), cov=cov_pose)
+    samples: dict[Covariance, Sample] = {}
+    kinds: tuple[Covariance, ...] = ("exact", "printed")
+    for covariance in kinds:
+        line = _fit(scan, estimate, noise_of(scanner), covariance)
+        samples[covariance] = Sample(nees(line_error(line, wall), line.cov), jnp.asarray(True))
+    return samples
+
+
+def pipeline(
+    key: Array,
+    world: World,
+    pose: Float[Array, "3"],
+    scanner: Scanner,
+    cov_pose: Float[Array, "3 3"],
+    **options: Any,
+) -> tuple[Sample, Sample]:
+    """The NEES of what `extract` finds: of the longest line of one wall, and of all lines.
+
+    A line belongs to the wall that most of its beams have met.
+
+    Args:
+      key: of the noise, of the pose's error, and of the choice of the wall.
+      world: walls.
+      pose: the true one.
+      scanner: its noise is what the extraction believes.
+      cov_pose: of the pose's error.
+      **options: of `extract`.
+    """
+    of_wall, of_scan, of_pose = jax.random.split(key, 3)
+    which, seen = _visible_wall(of_wall, world, pose, scanner)
+    scan, truth = simulate_scan(of_scan, world, pose, scanner)
+    estimate = Pose(mean=pose + _normal(of_pose, cov_pose), cov=cov_pose)
+    found = extract(scan, estimate, noise=noise_of(scanner), **options)
+    lines, count = found.lines, seen.shape[0]
+    beams = (found.line_of_beam[:, None] == jnp.arange(lines.valid.shape[0])[None]).astype(jnp.float32)
+    met = (truth.thing[:, None] == jnp.arange(count)[None]).astype(jnp.float32)
+    of_line = jnp.argmax(jnp.dot(beams.T, met), -1)
+    wall = jax.tree.map(lambda x: x[of_line], walls_of(world))
+    errors = nees(line_error(lines, wall), lines.cov)
+    length = jnp.where(lines.valid & (of_line == which), lines.length, 0)
+    longest = jnp.argmax(length)
+    return Sample(errors[longest], length[longest] > 0), Sample(errors, lines.valid)
+
+
+class Model(NamedTuple):
+    """What a map believes of the pose's error."""
+
+    pose_error: PoseError
+    persistence: Persistence | None = None
+
+
+def fused(
+    key: Array,
+    world: World,
+    path: Float[Array, "T 3"],
+    scanner: Scanner,
+    cov_pose: Float[Array, "3 3"],
+    correlation: Number,
+    models: Sequence[Model],
+) -> tuple[Float[Array, "M T"], Float[Array, "M T"]]:
+    """The NEES of one wall in the map after each scan, and the NIS of each scan's line before it is fused.
+
+    The fit is that of `known_points`; it is known which line is which.
+
+    Args:
+      key: of the noise, of the pose's error, and of the choice of the wall.
+      world: walls.
+      path: the true poses.
+      scanner: its noise is what the fit believes.
+      cov_pose: of the pose's error.
+      correlation: of the pose's error from one scan to the next, e[k+1] = a e[k] + sqrt(1 - a^2) w; 0 for errors that
+        are independent, 1 for one that stays.
+      models: what `M` maps believe of that.
+
+    Returns:
+      NEES, and NIS, which is zero where there is none: for the first scan, and where the wall is out of sight.
+    """
+    of_wall, of_start, of_scans, of_drift = jax.random.split(key, 4)
+    which, _ = _visible_wall(of_wall, world, path[0], scanner)
+    wall = jax.tree.map(lambda x: x[which], walls_of(world))
+
+    def step(
+        carry: tuple[Array, list[Lines]], x: tuple[Array, Array, Array, Array]
+    ) -> tuple[tuple[Array, list[Lines]], tuple[Array, Array]]:
+        error, held = carry
+        pose, of_scan, of_drift, is_first = x
+        on_wall = cast(world, pose[:2], unit(pose[2] + scanner.bearings)).thing == which
+        scan = _scan_of_wall(of_scan, wall, on_wall, pose, scanner)
+        line = _fit(scan, Pose(mean=pose + error, cov=cov_pose), noise_of(scanner), "exact")
+        seen = jnp.sum(on_wall) >= MIN_POINTS
+        improved = [_improve(line, before, ~is_first, seen, model) for before, model in zip(held, models, strict=True)]
+        held = [after for after, _ in improved]
+        errors = [nees(line_error(after, wall), after.cov) for after in held]
+        error = correlation * error + jnp.sqrt(1 - correlation**2) * _normal(of_drift, cov_pose)
+        return (error, held), (jnp.stack(errors), jnp.stack([nis for _, nis in improved]))
+
+    count = path.shape[0]
+    of_scans, of_drift = jax.random.split(of_scans, count), jax.random.split(of_drift, count)
+    nothing = jax.tree.map(lambda x: x[0], empty_lines(1, path.dtype))
+    start = (_normal(of_start, cov_pose), [nothing for _ in models])
+    _, (errors, nis) = jax.lax.scan(step, start, (path, of_scans, of_drift, jnp.arange(count) == 0))
+    return errors.T, nis.T
+
+
+def _improve(
+    line: Lines, before: Lines, has_prior: Bool[Array, ""], seen: Bool[Array, ""], model: Model
+) -> tuple[Lines, Float[Array, ""]]:
+    """A line of the map after one more scan, and the NIS before; without a prior it is the line of the scan.
+
+    Where the scan did not see it the line only ages, and there is no NIS.
+    """
+    persistence = persistence_of(model.pose_error, model.persistence)
+    before = forget(before, jnp.square(persistence.correlation))
+    before = jax.tree.map(lambda x, y: jnp.where(has_prior, x, y), before, line)
+    nis = compare_lines(forget(line, persistence.share), before, Thresholds(), model.pose_error).nis
+    one = jax.tree.map(lambda x: x[None], (before, line))
+    after = fuse_lines(
+        one[0],
+        has_prior[None],
+        one[1],
+        jnp.ones((1, 1), bool),
+        Thresholds(),
+        Rules(),
+        model.pose_error,
+        persistence.share,
+    )
+    after = jax.tree.map(lambda x, y: jnp.where(seen, x[0], y), after, before)
+    return after, jnp.where(has_prior & seen, nis, 0)
+
+
+def _visible_wall(
+    key: Array, world: World, pose: Float[Array, "3"], scanner: Scanner
+) -> tuple[Int[Array, ""], Int[Array, " S"]]:
+    """One of the walls that are seen, by chance, and how many nominal beams meet each."""
+    nominal = cast(world, pose[:2], unit(pose[2] + scanner.bearings)).thing
+    count = world.segments.valid.shape[0]
+    beams = jnp.sum(nominal[:, None] == jnp.arange(count)[None], 0, dtype=jnp.int32)
+    which = jax.random.categorical(key, jnp.where(beams >= SEEN_BEAMS, 0.0, -jnp.inf))
+    return which.astype(jnp.int32), beams
+
+
+def _scan_of_wall(
+    key: Array, wall: Walls, on_wall: Bool[Array, " N"], pose: Float[Array, "3"], scanner: Scanner
+) -> Scan:
+    """The beams on a wall, measured on the boundless wall; the others are masked."""
+    of_bearing, of_range = jax.random.split(key)
+    shape, dtype = scanner.bearings.shape, pose.dtype
+    beam = unit(pose[2] + scanner.bearings + scanner.bearing_sigma * jax.random.normal(of_bearing, shape, dtype))
+    normal = unit(wall.angle)
+    ranges = dot(normal, wall.point - pose[:2]) / dot(beam, normal[None])
+    ranges = ranges + scanner.range_sigma * jax.random.normal(of_range, shape, dtype)
+    scan = Scan.from_ranges(ranges, scanner.bearings)
+    return dataclasses.replace(scan, valid=scan.valid & on_wall)
+
+
+def _fit(scan: Scan, pose: Pose, noise: SensorNoise, covariance: Covariance) -> Lines:
+    """The line through all returns of a scan. No batch axis."""
+    mount = jax.tree.map(lambda x: jnp.asarray(x, pose.mean.dtype), Mount())
+    points = points_from_scan(scan, pose, mount, jacobians="analytic")
+    count = jnp.sum(points.valid, dtype=jnp.int32)
+    runs = Runs(
+        first=jnp.zeros(1, jnp.int32),
+        last=(count - 1)[None],
+        valid=jnp.ones(1, bool),
+        of_point=jnp.where(points.valid, 0, -1),
+    )
+    lines, _, _ = measure_lines(points, pose, runs, noise, covariance=covariance, jacobians="analytic")
+    return jax.tree.map(lambda x: x[0], lines)
+
+
+def _normal(key: Array, cov: Float[Array, "3 3"]) -> Float[Array, "3"]:
+    return square_root(cov) @ jax.random.normal(key, (3,), cov.dtype)
+
+
+class Verdict(NamedTuple):
+    """What many runs say of one configuration."""
+
+    runs: int
+    mean: float
+    median: float
+    inside: float  # share of runs inside the 95 % ellipse
+
+
+def judge(sample: Sample) -> Verdict:
+    """Mean and median of the NEES of two numbers, and the share of runs inside the 95 % ellipse.
+
+    Raises:
+      ValueError: if there is no run that counts.
+    """
+    values = np.asarray(sample.nees)[np.asarray(sample.counts)]
+    if not values.size:
+        raise ValueError("no run has found a line")
+    inside = float(np.mean(values < CHI2_95))
+    return Verdict(values.size, float(np.mean(values)), float(np.median(values)), inside)
+
+
+class Bands(NamedTuple):
+    """Where mean and coverage lie, with a given probability for all cells of a table together."""
+
+    mean: tuple[float, float]
+    inside: tuple[float, float]
+
+
+def bands(runs: int, cells: int = 1, *, error: float = 0.001, dof: int = 2) -> Bands:
+    """The bands of the mean NEES and of the share inside the 95 % ellipse, if covariances are right.
+
+    Args:
+      runs: of each cell, independent.
+      cells: of the whole table, which is judged together (Bonferroni).
+      error: the probability that any of the cells leaves a band though all is right.
+      dof: degrees of freedom of the NEES.
+
+    Returns:
+      The bands. Chi-square after Wilson and Hilferty (1931), the share by the normal approximation.
+    """
+    z = NormalDist().inv_cdf(1 - error / cells / 2)
+    k = runs * dof
+    low, high = (k * (1 - 2 / (9 * k) + s * z * math.sqrt(2 / (9 * k))) ** 3 / runs for s in (-1, 1))
+    spread = z * math.sqrt(0.05 * 0.95 / runs)
+    return Bands((low, high), (0.95 - spread, 0.95 + spread))
