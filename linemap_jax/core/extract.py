@@ -118,7 +118,13 @@ def extract_points(
     runs, lines_full = select_runs(run.n, ends & ~few & ~short, capacity.lines)
     own = without_corner_points(points, runs, noise) if rules.leave_out_corners else runs
     lines, jac_line_pose, cov_measurement = measure_lines(
-        points, pose, own, noise, covariance=covariance, jacobians=jacobians
+        points,
+        pose,
+        own,
+        noise,
+        maximum_likelihood=rules.maximum_likelihood,
+        covariance=covariance,
+        jacobians=jacobians,
     )
 
     cluster_ends, cluster = circles_.cluster(points, points.valid & (runs.of_point < 0), thresholds)

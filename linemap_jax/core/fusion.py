@@ -20,7 +20,6 @@ from linemap_jax.core.settings import Number, PoseError, Rules, Thresholds
 from linemap_jax.core.slots import choose, least, take
 from linemap_jax.core.state import Circles, Lines, pytree, squared
 
-
 JACOBIAN_ERROR = 0.01
 """How well A is known, relative to its size: Jacobians are taken at an estimated pose, which is half a degree off. A
 gain that lets an error that persists cancel between two viewpoints would believe in A to the last digit."""

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from linemap_jax.core import likelihood
 from linemap_jax.core.frames import dot, perp, shift_matrix, wrap_angle
 from linemap_jax.core.propagation import product, propagate, quadratic, square_root, symmetric
 from linemap_jax.core.runs import Runs
@@ -179,6 +180,7 @@ def measure_lines(
     runs: Runs,
     noise: SensorNoise,
     *,
+    maximum_likelihood: bool,
     covariance: Covariance,
     jacobians: Jacobians,
 ) -> tuple[Lines, Float[Array, "K 2 3"], Float[Array, "K 2 2"]]:
@@ -194,6 +196,7 @@ def measure_lines(
       pose: of the robot.
       runs: the runs that are lines; free slots give free lines.
       noise: of the sensor.
+      maximum_likelihood: go on from the regression by a step of `likelihood`.
       covariance: "exact" or "printed".
       jacobians: "autodiff" or "analytic".
 
@@ -205,10 +208,16 @@ def measure_lines(
     anchor_world = robot + (fit.origin + fit.centroid)
     # Rounding has moved the anchor by up to half a digit of the world's coordinates; the offset makes up for it.
     anchor = anchor_world - robot
-    offset, angle = line_from_regression(fit, anchor)
+    line = line_from_regression(fit, anchor)
+    if maximum_likelihood:
+        at = likelihood.linearise(points, runs, anchor, line, noise)
+        jac = likelihood.jac_step_points(points.position, runs, line, at, jacobians=jacobians)
+        line = likelihood.step(points.position, runs, line, at)
+    else:
+        jac = jac_line_points(points.position, runs, anchor, jacobians=jacobians)
+    offset, angle = line
     extent = line_extent(points.position, runs, anchor, angle)
 
-    jac = jac_line_points(points.position, runs, anchor, jacobians=jacobians)
     sigma = jnp.stack([noise.range_sigma, noise.bearing_sigma])
     from_noise = product(jac, points.jac_measurement) * sigma[None, None]
     from_pose = product(jac, points.jac_pose)

@@ -145,6 +145,9 @@ class Rules:
     give_back_point: bool = True
     """A run that criterion 2 ends gives its last point to the next run: just past a corner, points of the next wall
     still pass the gate, and they spoil the fit."""
+    maximum_likelihood: bool = True
+    """The line of a run is the most likely one, for noise along the beams. Regression takes the noise to lie across,
+    and is biased where a wall is seen at a slant."""
     leave_out_corners: bool = True
     """Points at the end of a run that may belong to the line beside it take no part in the fit."""
     fit_circles: bool = True

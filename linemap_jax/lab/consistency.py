@@ -12,6 +12,7 @@ Three experiments, each a function of a key that makes one run; map them over ke
 """
 
 import dataclasses
+import enum
 import math
 from collections.abc import Sequence
 from statistics import NormalDist
@@ -31,7 +32,6 @@ from linemap_jax.core.propagation import inverse, quadratic, square_root
 from linemap_jax.core.runs import Runs
 from linemap_jax.core.sensor import points_from_scan
 from linemap_jax.core.settings import (
-    Covariance,
     Mount,
     Number,
     Persistence,
@@ -90,10 +90,21 @@ class Sample(NamedTuple):
     counts: Array  # false where nothing was found
 
 
+class Fit(enum.Enum):
+    """An estimate of a line with a covariance."""
+
+    DEFAULT = "default"
+    """The most likely line, with the exact covariance."""
+    REGRESSION = "regression"
+    """The paper's regression, with the exact covariance."""
+    PRINTED = "printed"
+    """The paper's regression, with the covariance of Eq. (12)."""
+
+
 def known_points(
     key: Array, world: World, pose: Float[Array, "3"], scanner: Scanner, cov_pose: Float[Array, "3 3"]
-) -> dict[Covariance, Sample]:
-    """The NEES of a fit to the known points of one wall, with `exact` and with `printed` covariance.
+) -> dict[str, Sample]:
+    """The NEES of each `Fit` to the known points of one wall.
 
     Of the walls that the scanner sees one is chosen by chance. Its points are the beams whose nominal direction meets
     it; they are measured on the boundless wall, so that no noise decides which points take part.
@@ -111,12 +122,8 @@ def known_points(
     on_wall = cast(world, pose[:2], unit(pose[2] + scanner.bearings)).thing == which
     scan = _scan_of_wall(of_scan, wall, on_wall, pose, scanner)
     estimate = Pose(mean=pose + _normal(of_pose, cov_pose), cov=cov_pose)
-    samples: dict[Covariance, Sample] = {}
-    kinds: tuple[Covariance, ...] = ("exact", "printed")
-    for covariance in kinds:
-        line = _fit(scan, estimate, noise_of(scanner), covariance)
-        samples[covariance] = Sample(nees(line_error(line, wall), line.cov), jnp.asarray(True))
-    return samples
+    lines = {kind.value: _fit(scan, estimate, noise_of(scanner), kind) for kind in Fit}
+    return {name: Sample(nees(line_error(line, wall), line.cov), jnp.asarray(True)) for name, line in lines.items()}
 
 
 def pipeline(
@@ -199,7 +206,7 @@ def fused(
         pose, of_scan, of_drift, is_first = x
         on_wall = cast(world, pose[:2], unit(pose[2] + scanner.bearings)).thing == which
         scan = _scan_of_wall(of_scan, wall, on_wall, pose, scanner)
-        line = _fit(scan, Pose(mean=pose + error, cov=cov_pose), noise_of(scanner), "exact")
+        line = _fit(scan, Pose(mean=pose + error, cov=cov_pose), noise_of(scanner), Fit.DEFAULT)
         seen = jnp.sum(on_wall) >= MIN_POINTS
         improved = [_improve(line, before, ~is_first, seen, model) for before, model in zip(held, models, strict=True)]
         held = [after for after, _ in improved]
@@ -266,7 +273,7 @@ def _scan_of_wall(
     return dataclasses.replace(scan, valid=scan.valid & on_wall)
 
 
-def _fit(scan: Scan, pose: Pose, noise: SensorNoise, covariance: Covariance) -> Lines:
+def _fit(scan: Scan, pose: Pose, noise: SensorNoise, kind: Fit) -> Lines:
     """The line through all returns of a scan. No batch axis."""
     mount = jax.tree.map(lambda x: jnp.asarray(x, pose.mean.dtype), Mount())
     points = points_from_scan(scan, pose, mount, jacobians="analytic")
@@ -277,7 +284,15 @@ def _fit(scan: Scan, pose: Pose, noise: SensorNoise, covariance: Covariance) -> 
         valid=jnp.ones(1, bool),
         of_point=jnp.where(points.valid, 0, -1),
     )
-    lines, _, _ = measure_lines(points, pose, runs, noise, covariance=covariance, jacobians="analytic")
+    lines, _, _ = measure_lines(
+        points,
+        pose,
+        runs,
+        noise,
+        maximum_likelihood=kind is Fit.DEFAULT,
+        covariance="printed" if kind is Fit.PRINTED else "exact",
+        jacobians="analytic",
+    )
     return jax.tree.map(lambda x: x[0], lines)
 
 
