@@ -37,7 +37,8 @@ def extracted(ranges: np.ndarray, fit: bool, pose: Pose = HERE) -> Extraction:
 def only(found: Extraction) -> dict[str, Any]:
     """The one circle."""
     (slot,) = np.flatnonzero(found.circles.valid)
-    return {f.name: np.asarray(getattr(found.circles, f.name))[slot] for f in dataclasses.fields(found.circles)}
+    names = [*(field.name for field in dataclasses.fields(found.circles)), "cov"]
+    return {name: np.asarray(getattr(found.circles, name))[slot] for name in names}
 
 
 @pytest.mark.parametrize("x", [0.0, 1000.0])
@@ -100,11 +101,13 @@ def test_a_noisy_pole_is_found_where_it_is_and_its_covariance_says_how_well() ->
 def test_covariance_of_a_fit_holds_the_pose() -> None:
     cov = jnp.diag(jnp.array([0.05, 0.02, 0.01])) ** 2
     ranges = pole((2.0, 0.0), 0.15)
-    alone = only(extracted(ranges, fit=True))["cov"]
-    with_pose = only(extracted(ranges, fit=True, pose=Pose(mean=jnp.zeros(3), cov=cov)))["cov"]
+    circle = only(extracted(ranges, fit=True, pose=Pose(mean=jnp.zeros(3), cov=cov)))
+    alone, with_pose = only(extracted(ranges, fit=True))["cov"], circle["cov"]
     # The pole is 2 m ahead: the heading moves it sideways by 2 m times as much; its radius stays.
     np.testing.assert_allclose(with_pose - alone, np.diag([0.05**2, 0.02**2 + 0.02**2, 0]), atol=1e-10)
     assert np.all(np.linalg.eigvalsh(alone) > 0)
+    # Only the sensor's part is the scan's own.
+    np.testing.assert_allclose(circle["cov_independent"], alone, atol=1e-12)
 
 
 def test_too_few_points_are_not_fitted() -> None:
@@ -172,7 +175,8 @@ def test_near_a_line(x: float, y: float, radius: float, fitted: bool, near: bool
         extent=jnp.array([[-0.5, 1.5], [-9.0, 9.0]]),  # along -x from (0.5, 0): from x = 1 to x = -1
         valid=jnp.array([True, False]),
     )
-    assert bool(near_lines(circle_at(x, y, radius, fitted), line, Thresholds())[0]) == near
+    thresholds = Thresholds(circle_line_distance=0.15)
+    assert bool(near_lines(circle_at(x, y, radius, fitted), line, thresholds)[0]) == near
 
 
 def test_circles_near_a_line_are_dropped_and_counted() -> None:

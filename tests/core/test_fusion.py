@@ -1,30 +1,40 @@
-"""Fusion of lines: Eq. (23), pieces that share a pose, ten thousand fusions in float32, and end points."""
+"""Fusion: Eq. (23), errors that persist, pieces that share a pose, ten thousand fusions in float32, and end points."""
 
 import dataclasses
 from functools import partial
-from typing import Any
+from typing import Any, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from linemap_jax.core.fusion import Pieces, fuse_circles, fuse_lines
+from linemap_jax.core.fusion import Errors, combine, forget, fuse_circles, fuse_lines
 from linemap_jax.core.matching import CircleMatches
-from linemap_jax.core.settings import PAPER_RULES, Rules, Thresholds
+from linemap_jax.core.settings import PAPER_RULES, PoseError, Rules, Thresholds
 from linemap_jax.core.state import Circles, Lines, empty_circles, empty_lines
 
-NO_POSE = np.zeros((3, 3))
+MODELS = get_args(PoseError)
+NOTHING = np.zeros((2, 3))
 
 
-def line(anchor: Any, offset: float, angle: float, cov: Any, extent: Any = (-1.0, 1.0), var: float = 1e-4) -> Lines:
-    """One line in one slot."""
+def line(
+    anchor: Any,
+    offset: float,
+    angle: float,
+    cov: Any,
+    root: Any = NOTHING,
+    extent: Any = (-1.0, 1.0),
+    var: float = 1e-4,
+) -> Lines:
+    """One line in one slot; `cov` and `root` are the two parts of its error."""
     return dataclasses.replace(
         empty_lines(1),
         anchor=jnp.asarray([anchor], float),
         offset=jnp.asarray([offset], float),
         angle=jnp.asarray([angle], float),
-        cov=jnp.asarray([cov], float),
+        cov_independent=jnp.asarray([cov], float),
+        sqrt_persistent=jnp.asarray([root], float),
         extent=jnp.asarray([extent], float),
         var_extent=jnp.full((1, 2), var),
         times_detected=jnp.ones(1, jnp.int32),
@@ -36,34 +46,38 @@ def stack(*items: Any) -> Any:
     return jax.tree.map(lambda *x: jnp.concatenate(x), *items)
 
 
-def reversed_(piece: Lines, jac: np.ndarray) -> tuple[Lines, np.ndarray]:
+def in_float32(tree: Any) -> Any:
+    return jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == jnp.float64 else x, tree)
+
+
+def reversed_(piece: Lines) -> Lines:
     """The same line seen from behind: offset and normal turn round, and so do the ends."""
-    flip = jnp.asarray([[1.0, -1.0], [-1.0, 1.0]])
-    turned = dataclasses.replace(
+    flip = jnp.array([-1.0, 1.0])
+    return dataclasses.replace(
         piece,
         offset=-piece.offset,
         angle=piece.angle + jnp.pi,
-        cov=piece.cov * flip[None],
+        cov_independent=piece.cov_independent * (flip[:, None] * flip[None])[None],
+        sqrt_persistent=piece.sqrt_persistent * flip[None, :, None],
         extent=-piece.extent[:, ::-1],
         var_extent=piece.var_extent[:, ::-1],
     )
-    return turned, jac * np.array([[-1.0], [1.0]])
 
 
-@partial(jax.jit, static_argnames="rules")
+@partial(jax.jit, static_argnames=("rules", "pose_error"))
 def fuse(
     model: Lines,
     pieces: Lines,
-    jac: jax.Array,
-    cov_pose: jax.Array,
     has_prior: jax.Array,
-    cov: jax.Array | None = None,
+    share: float | jax.Array = 1.0,
+    *,
     rules: Rules = Rules(),
+    pose_error: PoseError = "unknown",
 ) -> Lines:
     """All pieces belong to one line, which stands once for each of them in `model`."""
     n = pieces.valid.shape[0]
-    observed = Pieces(lines=pieces, cov_measurement=pieces.cov if cov is None else cov, jac_line_pose=jac)
-    return fuse_lines(model, has_prior, observed, jnp.ones((n, n), bool), cov_pose, Thresholds(), rules)
+    share = jnp.asarray(share, pieces.offset.dtype)
+    return fuse_lines(model, has_prior, pieces, jnp.ones((n, n), bool), Thresholds(), rules, pose_error, share)
 
 
 YES, NO = jnp.ones(1, bool), jnp.zeros(1, bool)
@@ -71,30 +85,37 @@ C_L = np.array([[4e-4, 1e-4], [1e-4, 9e-4]])
 C_M = np.array([[2e-4, -5e-5], [-5e-5, 3e-4]])
 
 
+@pytest.mark.parametrize("pose_error", MODELS)
 @pytest.mark.parametrize("behind", [False, True])
 @pytest.mark.parametrize("angle", [0.3, 3.13, -3.13])
-def test_one_piece_is_equation_23(angle: float, behind: bool) -> None:
+def test_one_piece_is_equation_23(angle: float, behind: bool, pose_error: PoseError) -> None:
+    """Where no error persists, whatever the model says of it."""
     model = line([5, 6], 0.01, angle, C_L)
     piece = line([5, 6], 0.03, angle + 0.02, C_M)
     # K = C_l (C_l + C_m)^-1, as printed
     gain = C_L @ np.linalg.inv(C_L + C_M)
     offset, turn = gain @ [0.02, 0.02]
     cov = C_L - gain @ C_L
-    if behind:
-        piece, _ = reversed_(piece, np.zeros((2, 3)))
-    fused = fuse(model, piece, jnp.zeros((1, 2, 3)), jnp.asarray(NO_POSE), YES)
+    fused = fuse(model, reversed_(piece) if behind else piece, YES, pose_error=pose_error)
     np.testing.assert_allclose(fused.offset[0], 0.01 + offset, rtol=1e-12)
     difference = float(fused.angle[0]) - angle - turn
     np.testing.assert_allclose(np.remainder(difference + 1, 2 * np.pi) - 1, 0, atol=1e-12)
     assert -np.pi < fused.angle[0] <= np.pi
     np.testing.assert_allclose(fused.cov[0], cov, rtol=1e-10, atol=1e-16)
+    assert not fused.sqrt_persistent.any()
     np.testing.assert_array_equal(fused.anchor, model.anchor)
     assert fused.times_detected[0] == 2
 
 
-def least_squares(
-    model: Lines, pieces: list[Lines], jacs: np.ndarray, covs: np.ndarray, cov_pose: np.ndarray, prior: bool
-) -> tuple[np.ndarray, np.ndarray]:
+def test_a_pose_error_that_does_not_persist_is_noise_of_equation_23() -> None:
+    root = np.array([[0.02, 0.01, 0.0], [0.0, 0.005, -0.01]])
+    model, piece = line([5, 6], 0.01, 0.3, C_L), line([5, 6], 0.03, 0.32, C_M, root)
+    fused = fuse(model, piece, YES, 0.0, pose_error="independent")
+    noisy = fuse(model, line([5, 6], 0.03, 0.32, C_M + root @ root.T), YES, pose_error="independent")
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-16), fused, noisy)
+
+
+def least_squares(model: Lines, pieces: list[Lines], prior: bool) -> tuple[np.ndarray, np.ndarray]:
     """Generalised least squares for a small change of the model, all pieces and the prior in one system."""
     angle = float(model.angle[0])
     normal, tangent = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
@@ -105,104 +126,267 @@ def least_squares(
         seen += [float(piece.offset[0] - model.offset[0]) - normal @ step, float(piece.angle[0]) - angle]
     n = len(pieces)
     cov = np.zeros((2 * n, 2 * n))
-    for i in range(n):
-        cov[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = covs[i]
-    shared = jacs.reshape(2 * n, 3)
-    weight = np.linalg.inv(cov + shared @ cov_pose @ shared.T)
+    for i, piece in enumerate(pieces):
+        cov[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = piece.cov_independent[0]
+    shared = np.concatenate([np.asarray(piece.sqrt_persistent[0]) for piece in pieces])
+    weight = np.linalg.inv(cov + shared @ shared.T)
     a = np.concatenate(rows)
     information = a.T @ weight @ a + (np.linalg.inv(model.cov[0]) if prior else 0)
     return np.linalg.solve(information, a.T @ weight @ np.array(seen)), np.linalg.inv(information)
 
 
+def pieces_of_one_scan(random: np.random.Generator, angle: float) -> list[Lines]:
+    """Three pieces of one line; a pose error moves the line, which each piece sees at its own anchor."""
+    tangent = np.array([-np.sin(angle), np.cos(angle)])
+    half = random.standard_normal((3, 2, 2))
+    covs = 1e-4 * half @ half.transpose(0, 2, 1) + 2e-5 * np.eye(2)
+    at_model = np.array([[*random.standard_normal(3)], [0, 0, 1]])
+    cov_pose = np.array([[9e-4, 1e-4, 1e-5], [1e-4, 4e-4, -2e-5], [1e-5, -2e-5, 1e-4]])
+    return [
+        line(
+            np.array([3, 1]) + s * tangent,
+            0.01 * random.standard_normal(),
+            angle + 0.01 * random.standard_normal(),
+            cov,
+            np.array([[1, -s], [0, 1]]) @ at_model @ np.linalg.cholesky(cov_pose),
+        )
+        for s, cov in zip((-2.0, 0.5, 4.0), covs, strict=True)
+    ]
+
+
 @pytest.mark.parametrize("behind", [False, True])
 @pytest.mark.parametrize("prior", [True, False])
 def test_pieces_that_share_a_pose_are_generalised_least_squares(prior: bool, behind: bool) -> None:
-    random = np.random.default_rng(2)
     angle = 0.8
-    tangent = np.array([-np.sin(angle), np.cos(angle)])
     model = line([3, 1], 0.0, angle, C_L)
-    half = random.standard_normal((3, 2, 2))
-    covs = 1e-4 * half @ half.transpose(0, 2, 1) + 2e-5 * np.eye(2)
-    # A pose error moves one and the same line, which each piece sees at its own anchor.
-    along = (-2.0, 0.5, 4.0)
-    at_model = np.array([[*random.standard_normal(3)], [0, 0, 1]])
-    jacs = np.stack([np.array([[1, -s], [0, 1]]) @ at_model for s in along])
-    cov_pose = np.array([[9e-4, 1e-4, 1e-5], [1e-4, 4e-4, -2e-5], [1e-5, -2e-5, 1e-4]])
-    pieces = [
-        line(
-            np.array([3, 1]) + s * tangent, 0.01 * random.standard_normal(), angle + 0.01 * random.standard_normal(), c
-        )
-        for s, c in zip(along, covs, strict=True)
-    ]
-    change, cov = least_squares(model, pieces, jacs, covs, cov_pose, prior)
+    pieces = pieces_of_one_scan(np.random.default_rng(2), angle)
+    change, cov = least_squares(model, pieces, prior)
+    # One after the other, as if independent, would believe too much.
+    alone = np.linalg.inv(sum(np.linalg.inv(np.asarray(piece.cov[0])) for piece in pieces))
+    if not prior:
+        assert np.linalg.det(alone) < np.linalg.det(cov)
     if behind:
-        pieces[1], jacs[1] = reversed_(pieces[1], jacs[1])
-    observed = stack(*pieces)
-    fused = fuse(stack(model, model, model), observed, jnp.asarray(jacs), jnp.asarray(cov_pose), jnp.full(3, prior))
+        pieces[1] = reversed_(pieces[1])
+    fused = fuse(stack(model, model, model), stack(*pieces), jnp.full(3, prior), 0.0, pose_error="independent")
     for i in range(3):
         np.testing.assert_allclose([fused.offset[i], fused.angle[i] - angle], change, rtol=1e-8, atol=1e-13)
         np.testing.assert_allclose(fused.cov[i], cov, rtol=1e-8, atol=1e-15)
     assert fused.times_detected.tolist() == [2 if prior else 1] * 3
-    # One after the other as if independent would believe too much.
-    alone = np.linalg.inv(sum(np.linalg.inv(c + j @ cov_pose @ j.T) for c, j in zip(covs, jacs, strict=True)))
-    if not prior:
-        assert np.linalg.det(alone) < np.linalg.det(cov)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("pose_error", ["persistent", "unknown"])
+def test_what_persists_of_a_new_line_is_its_share_of_the_pose(share: float, pose_error: PoseError) -> None:
+    pieces = pieces_of_one_scan(np.random.default_rng(2), 0.8)
+    model = line([3, 1], 0.0, 0.8, C_L)
+    change, cov = least_squares(model, pieces, prior=False)
+    fused = fuse(stack(model, model, model), stack(*pieces), jnp.zeros(3, bool), share, pose_error=pose_error)
+    np.testing.assert_allclose([fused.offset[0], fused.angle[0] - 0.8], change, rtol=1e-8)
+    np.testing.assert_allclose(fused.cov[0], cov, rtol=1e-8, atol=1e-15)
+    # The pose moves the pieces as it moves the one line that they are; the first one lies at -2 m.
+    root = np.array([[1, -2], [0, 1]]) @ np.asarray(pieces[0].sqrt_persistent[0])
+    np.testing.assert_allclose(fused.sqrt_persistent[0], np.sqrt(share) * root, rtol=1e-8, atol=1e-12)
 
 
 def test_pieces_of_other_lines_do_not_matter() -> None:
     model, piece = line([5, 6], 0.01, 0.3, C_L), line([5, 6], 0.03, 0.32, C_M)
-    other = line([-50, 6], 3.0, 1.3, C_M)
-    pieces = Pieces(
-        lines=stack(piece, other), cov_measurement=stack(piece.cov, other.cov), jac_line_pose=jnp.zeros((2, 2, 3))
-    )
+    other = line([-50, 6], 3.0, 1.3, C_M, np.full((2, 3), 0.01))
     together = fuse_lines(
-        stack(model, other), stack(YES, NO), pieces, jnp.eye(2, dtype=bool), jnp.asarray(NO_POSE), Thresholds(), Rules()
+        stack(model, other),
+        stack(YES, NO),
+        stack(piece, other),
+        jnp.eye(2, dtype=bool),
+        Thresholds(),
+        Rules(),
+        "unknown",
+        jnp.asarray(1.0),
     )
-    alone = fuse(model, piece, jnp.zeros((1, 2, 3)), jnp.asarray(NO_POSE), YES)
+    alone = fuse(model, piece, YES)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a[:1], b, rtol=1e-12), together, alone)
     # A new line is its piece.
-    for name in ("offset", "angle", "cov", "extent", "var_extent", "times_detected"):
-        np.testing.assert_allclose(getattr(together, name)[1], getattr(other, name)[0], rtol=1e-9)
+    for field in dataclasses.fields(other):
+        before, after = (np.asarray(getattr(x, field.name), float)[-1] for x in (other, together))
+        np.testing.assert_allclose(after, before, rtol=1e-9)
 
 
-@pytest.mark.parametrize("lever", [0.0, 5.0, 50.0])
-def test_ten_thousand_fusions_in_float32_stay_positive_definite(lever: float) -> None:
-    lower = partial(jax.tree.map, lambda x: x.astype(jnp.float32) if x.dtype == jnp.float64 else x)
+PERSISTING = np.array([[0.03, 0.02, -0.01], [0.0, 0.004, 0.009]])
+
+
+@pytest.mark.parametrize(
+    ("pose_error", "root", "lever", "sigmas"),
+    [(*model, lever, 1e-3) for model in (("independent", NOTHING), ("unknown", PERSISTING)) for lever in (0, 5, 50)]
+    # Away from the anchor what should cancel, A_new - A_old, is rounding, and that is the same in all scans.
+    + [("persistent", PERSISTING, lever, sigmas) for lever, sigmas in ((0, 1e-3), (5, 3e-3), (50, 0.03))],
+)
+def test_ten_thousand_fusions_in_float32(pose_error: PoseError, root: np.ndarray, lever: float, sigmas: float) -> None:
+    """They stay positive definite, and are those in float64."""
     cov = np.diag([0.01, 0.005]) ** 2
-    start = lower(line([0, 0], 0.0, 0.4, cov))
-    tangent = np.array([-np.sin(0.4), np.cos(0.4)])
-    piece = lower(line(lever * tangent, 0.0, 0.4, cov))
-    # The same piece seen with its noise
-    noise = np.random.default_rng(3).standard_normal((10_000, 2)) * [0.01, 0.005]
-
-    def step(model: Lines, change: jax.Array) -> tuple[Lines, jax.Array]:
-        seen = dataclasses.replace(piece, offset=piece.offset + change[0], angle=piece.angle + change[1])
-        model = fuse(model, seen, jnp.zeros((1, 2, 3), jnp.float32), jnp.zeros((3, 3), jnp.float32), YES)
-        return model, model.cov[0]
-
-    model, covs = jax.jit(partial(jax.lax.scan, step))(start, jnp.asarray(noise, jnp.float32))
-    covs = np.asarray(covs)
-    assert covs.dtype == np.float32
-    np.testing.assert_array_equal(covs, covs.transpose(0, 2, 1))
-    eigenvalues = np.linalg.eigvalsh(covs.astype(float))
-    assert np.all(eigenvalues > 0)
-    # Against one least-squares problem in float64
+    start = line([0, 0], 0.0, 0.4, cov, root)
     shift = np.array([[1, -lever], [0, 1]])
-    information = np.linalg.inv(cov) + 10_000 * shift.T @ np.linalg.inv(cov) @ shift
-    expected = np.linalg.inv(information)
-    np.testing.assert_allclose(covs[-1], expected, rtol=0.05, atol=0.05 * np.abs(expected).max())
+    piece = line(lever * np.array([-np.sin(0.4), np.cos(0.4)]), 0.0, 0.4, cov, shift @ root)
+    # The same piece seen with its noise, in numbers that float32 holds
+    noise = np.random.default_rng(3).standard_normal((10_000, 2)) * [0.01, 0.005]
+    noise = jnp.asarray(noise, jnp.float32)
+
+    def run(start: Lines, piece: Lines) -> tuple[Lines, np.ndarray, np.ndarray]:
+        def step(model: Lines, change: jax.Array) -> Any:
+            change = change.astype(piece.offset.dtype)
+            seen = dataclasses.replace(piece, offset=piece.offset + change[0], angle=piece.angle + change[1])
+            model = fuse(model, seen, YES, pose_error=pose_error)
+            return model, (model.cov[0], jnp.stack([model.offset[0], model.angle[0]]))
+
+        model, (covs, means) = jax.jit(partial(jax.lax.scan, step))(start, noise)
+        return model, np.asarray(covs), np.asarray(means)
+
+    model, covs, means = run(*in_float32((start, piece)))
+    _, exact, exact_means = run(start, piece)
+    assert covs.dtype == means.dtype == np.float32
+    assert exact.dtype == np.float64
+    np.testing.assert_array_equal(covs, covs.transpose(0, 2, 1))
+    assert np.all(np.linalg.eigvalsh(covs.astype(float)) > 0)
+    difference = np.linalg.norm(covs - exact, axis=(1, 2)) / np.linalg.norm(exact, axis=(1, 2))
+    np.testing.assert_array_less(difference, 1e-3)
+    # The angle itself is rounded 10 000 times, by at most half a unit in the last place.
+    sigma = np.sqrt(np.diagonal(exact, axis1=1, axis2=2))
+    rounding = np.sqrt(len(covs)) * np.spacing(np.abs(exact_means).astype(np.float32)) / 2
+    np.testing.assert_array_less(np.abs(means - exact_means), sigmas * sigma + rounding)
     assert model.times_detected[0] == 10_001
+    if pose_error == "independent":
+        # Against one least-squares problem
+        expected = np.linalg.inv(np.linalg.inv(cov) + 10_000 * shift.T @ np.linalg.inv(cov) @ shift)
+        np.testing.assert_allclose(exact[-1], expected, rtol=1e-6)
+
+
+def errors_of(primitives: Any) -> Errors:
+    names = [field.name for field in dataclasses.fields(Errors)]
+    return Errors(**{name: getattr(primitives, name) for name in names})
+
+
+def random_errors(random: np.random.Generator, count: int, n: int) -> Errors:
+    """Errors of `count` estimates, either part of which may be the larger one by a factor of 100."""
+    half = random.standard_normal((count, n, n)) * 10 ** random.uniform(-1, 1, (count, 1, 1))
+    root = random.standard_normal((count, n, 3)) * 10 ** random.uniform(-1, 1, (count, 1, 1))
+    return Errors(
+        cov_independent=jnp.asarray(half @ half.transpose(0, 2, 1) + 1e-3 * np.eye(n)),
+        sqrt_persistent=jnp.asarray(root),
+        times_detected=jnp.asarray(random.integers(1, 30, count), jnp.int32),
+    )
+
+
+def test_persistent_is_a_kalman_filter_that_considers_the_pose_error() -> None:
+    """A filter in NumPy on (line, u), that ages u by its model and updates the line alone (Schmidt-Kalman)."""
+    random = np.random.default_rng(7)
+    correlation = 0.8
+    scans = random_errors(random, 30, 2)
+    seen = random.standard_normal((30, 2))
+    take = lambda i: jax.tree.map(lambda x: x[i : i + 1], scans)  # noqa: E731
+
+    mine, estimate = take(0), seen[0]
+    c, a = np.asarray(scans.cov_independent[0]), np.asarray(scans.sqrt_persistent[0])
+    # The first scan says x = seen - a u - noise, and u is estimated by zero.
+    state, p = np.concatenate([seen[0], np.zeros(3)]), np.block([[c + a @ a.T, -a], [-a.T, np.eye(3)]])
+    for i in range(1, 30):
+        mine = forget(mine, correlation**2)
+        gain, mine = jax.jit(combine, static_argnames="pose_error")(mine, take(i), "persistent")
+        estimate = estimate + np.asarray(gain[0]) @ (seen[i] - estimate)
+
+        f = np.diag([1, 1, *[correlation] * 3])
+        p = f @ p @ f.T + np.diag([0, 0, *[1 - correlation**2] * 3])
+        a = np.asarray(scans.sqrt_persistent[i])
+        h = np.concatenate([np.eye(2), a], 1)
+        # What a scan says of u is known to one part in a hundred.
+        r = np.asarray(scans.cov_independent[i]) + 0.01**2 * a @ a.T
+        k = p @ h.T @ np.linalg.inv(h @ p @ h.T + r)
+        k[2:] = 0
+        state = state + k @ (seen[i] - h @ state)
+        p = (np.eye(5) - k @ h) @ p @ (np.eye(5) - k @ h).T + k @ r @ k.T
+
+        np.testing.assert_allclose(estimate, state[:2], rtol=1e-8)
+        root = np.asarray(mine.sqrt_persistent[0])
+        np.testing.assert_allclose(root, -p[:2, 2:], rtol=1e-7, atol=1e-9)
+        np.testing.assert_allclose(mine.cov_independent[0] + root @ root.T, p[:2, :2], rtol=1e-7, atol=1e-10)
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_unknown_is_a_bound_for_every_correlation(n: int) -> None:
+    random = np.random.default_rng(8)
+    count = 2000
+    old, new = random_errors(random, count, n), random_errors(random, count, n)
+    gain, fused = jax.jit(combine, static_argnames="pose_error")(old, new, "unknown")
+    k = np.asarray(gain)
+    keep = np.eye(n) - k
+    root = np.asarray(fused.sqrt_persistent)
+    stated = np.asarray(fused.cov_independent) + root @ root.transpose(0, 2, 1)
+    # The correlation of u_old and u_new is any contraction: singular values of at most one.
+    u, _, v = np.linalg.svd(random.standard_normal((count, 3, 3)))
+    singular = np.where(random.uniform(size=(count, 3)) < 0.5, 1, random.uniform(size=(count, 3)))
+    correlation = u * singular[:, None] @ v
+    across = keep @ np.asarray(old.sqrt_persistent) @ correlation
+    across = across @ (k @ np.asarray(new.sqrt_persistent)).transpose(0, 2, 1)
+    parts = [
+        part @ np.asarray(errors.cov_independent) @ part.transpose(0, 2, 1)
+        + (part @ np.asarray(errors.sqrt_persistent)) @ (part @ np.asarray(errors.sqrt_persistent)).transpose(0, 2, 1)
+        for part, errors in ((keep, old), (k, new))
+    ]
+    true = parts[0] + parts[1] + across + across.transpose(0, 2, 1)
+    scale = np.linalg.norm(stated, axis=(1, 2))
+    assert np.all(np.linalg.eigvalsh(stated - true)[:, 0] > -1e-12 * scale)
+    # To leave the correlation out is no bound.
+    ignorant = np.linalg.eigvalsh(parts[0] + parts[1] - true)[:, 0] < -1e-3 * scale
+    assert ignorant.mean() > 0.5
+
+
+def test_equal_views_are_averaged_and_what_they_may_share_stays() -> None:
+    """Of n equal views each counts 1/n; the bound is met, since all of them may have one and the same pose error."""
+    one = line([0, 0], 0.0, 0.4, C_L, PERSISTING)
+    offsets = 0.01 * np.random.default_rng(9).standard_normal(20)
+    model = dataclasses.replace(one, offset=jnp.asarray(offsets[:1]))
+    for n, offset in enumerate(offsets[1:], 2):
+        model = fuse(model, dataclasses.replace(one, offset=jnp.asarray([offset])), YES)
+        np.testing.assert_allclose(model.offset[0], offsets[:n].mean(), atol=1e-8)
+        np.testing.assert_allclose(model.cov_independent[0], C_L / n, rtol=1e-6)
+        root = np.asarray(model.sqrt_persistent[0])
+        np.testing.assert_allclose(root @ root.T, PERSISTING @ PERSISTING.T, rtol=1e-6)
+    assert model.times_detected[0] == 20
+
+
+def test_forgetting_leaves_the_covariance_as_it_is() -> None:
+    before = line([0, 0], 0.0, 0.4, C_L, PERSISTING)
+    for share in (0.0, 0.25, 1.0):
+        after = forget(before, share)
+        np.testing.assert_allclose(after.cov, before.cov, rtol=1e-12)
+        np.testing.assert_allclose(after.sqrt_persistent[0], np.sqrt(share) * PERSISTING, rtol=1e-12)
+
+
+@pytest.mark.parametrize("pose_error", MODELS)
+@pytest.mark.parametrize(("old", "new"), [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)])
+def test_gradients_are_finite_where_nothing_persists(old: float, new: float, pose_error: PoseError) -> None:
+    model = line([0, 0], 0.0, 0.4, C_L, old * PERSISTING)
+    piece = line([0.1, 0], 0.01, 0.42, C_M, new * PERSISTING)
+
+    def total(model: Lines, piece: Lines) -> jax.Array:
+        fused = fuse(model, piece, YES, pose_error=pose_error)
+        return sum(
+            jnp.sum(getattr(fused, name))
+            for name in ("offset", "angle", "cov_independent", "sqrt_persistent", "extent", "var_extent")
+        )
+
+    gradients = jax.grad(total, (0, 1), allow_int=True)(model, piece)
+    for gradient in gradients:
+        for name in ("offset", "angle", "cov_independent", "sqrt_persistent"):
+            assert np.isfinite(getattr(gradient, name)).all(), name
+        assert np.any(gradient.cov_independent != 0)
 
 
 def ends_after(rules: Rules, begins: np.ndarray, ends: np.ndarray, sigma: float) -> tuple[np.ndarray, np.ndarray]:
     """The extents of a line along y after each of the scans, and their variances; it starts as the first of them."""
-    piece = line([0, 0], 0.0, 0.0, np.eye(2) * 1e-6, (0, 0), sigma**2)
+    piece = line([0, 0], 0.0, 0.0, np.eye(2) * 1e-6, extent=(0, 0), var=sigma**2)
 
     def at(extent: jax.Array) -> Lines:
         return dataclasses.replace(piece, extent=extent[None])
 
     def step(model: Lines, extent: jax.Array) -> tuple[Lines, Any]:
-        model = fuse(model, at(extent), jnp.zeros((1, 2, 3)), jnp.asarray(NO_POSE), YES, rules=rules)
+        model = fuse(model, at(extent), YES, rules=rules)
         return model, (model.extent[0], model.var_extent[0])
 
     extents = jnp.asarray(np.stack([begins, ends], -1))
@@ -248,14 +432,14 @@ def circle(x: float, radius: float, var: float, fitted: bool, times: int = 1) ->
         empty_circles(1),
         center=jnp.array([[x, 2.0]]),
         radius=jnp.array([radius]),
-        cov=jnp.eye(3)[None] * var * fitted,
+        cov_independent=jnp.eye(3)[None] * var * fitted,
         fitted=jnp.array([fitted]),
         times_detected=jnp.array([times], jnp.int32),
         valid=jnp.ones(1, bool),
     )
 
 
-def fused_circle(model: Circles, new: Circles, rules: Rules) -> Circles:
+def fused_circle(model: Circles, new: Circles, rules: Rules, pose_error: PoseError = "independent") -> Circles:
     k = new.valid.shape[0]
     matches = CircleMatches(
         slot=jnp.zeros(k, jnp.int32),
@@ -264,7 +448,7 @@ def fused_circle(model: Circles, new: Circles, rules: Rules) -> Circles:
         dof=jnp.zeros(k, jnp.int32),
         ambiguous=jnp.zeros(k, bool),
     )
-    return fuse_circles(model, new, matches, rules)
+    return fuse_circles(model, new, matches, rules, pose_error)
 
 
 def test_equations_24_and_25_are_the_mean_of_old_and_new() -> None:
@@ -289,3 +473,18 @@ def test_circles_are_weighed(old: Any, new: Any, x: float, radius: float, var: f
     np.testing.assert_allclose(fused.radius, [radius], rtol=1e-12)
     np.testing.assert_allclose(fused.cov[0], var * np.eye(3), atol=1e-15)
     assert (bool(fused.fitted[0]), int(fused.times_detected[0])) == (fitted, 4)
+
+
+@pytest.mark.parametrize("pose_error", MODELS)
+def test_fitted_circles_are_combined_as_lines_are(pose_error: PoseError) -> None:
+    old, new = circle(1.0, 0.1, 3e-4, True, times=3), circle(1.2, 0.2, 1e-4, True)
+    root = jnp.array([[[0.03, 0.0, 0.01], [0.0, 0.02, -0.01], [0.0, 0.0, 0.0]]])
+    old, new = (dataclasses.replace(x, sqrt_persistent=factor * root) for x, factor in ((old, 1.0), (new, 0.5)))
+    fused = fused_circle(old, new, Rules(), pose_error)
+    gain, errors = combine(errors_of(old), errors_of(new), pose_error)
+    np.testing.assert_allclose(
+        fused.center[0], np.array([1, 2]) + 0.2 * gain[0, :2, 0] + 0.1 * gain[0, :2, 2], rtol=1e-12
+    )
+    np.testing.assert_allclose(fused.cov_independent, errors.cov_independent, rtol=1e-12)
+    np.testing.assert_allclose(fused.sqrt_persistent, errors.sqrt_persistent, rtol=1e-12, atol=1e-15)
+    assert fused.sqrt_persistent.any()

@@ -206,6 +206,10 @@ def test_exact_covariance_is_that_of_all_points_together(measured: dict[str, Any
         np.testing.assert_allclose(jac_pose[k], jac[k] @ f, atol=1e-9)
         parts = cov_measurement[k] + jac_pose[k] @ np.asarray(POSE.cov) @ jac_pose[k].T
         np.testing.assert_allclose(lines.cov[k], parts, rtol=1e-12, atol=1e-15)
+        # What the pose adds stands apart, in units of the pose's sigmas.
+        root = jac_pose[k] @ np.linalg.cholesky(np.asarray(POSE.cov))
+        np.testing.assert_allclose(lines.sqrt_persistent[k], root, rtol=1e-9, atol=1e-12)
+        np.testing.assert_array_equal(lines.cov_independent[k], cov_measurement[k])
     np.testing.assert_array_equal(lines.valid, [True] * 3 + [False])
 
 
@@ -223,6 +227,7 @@ def test_printed_covariance_is_a_sum_of_independent_points(measured: dict[str, A
         np.testing.assert_allclose(lines.cov[k], expected, rtol=1e-9, atol=1e-9 * np.linalg.norm(expected))
         np.testing.assert_allclose(cov_measurement[k], expected, rtol=1e-9, atol=1e-9 * np.linalg.norm(expected))
     assert not jac_pose.any()
+    assert not lines.sqrt_persistent.any()
     # To count the pose error once for each point is to believe too much.
     assert np.all(lines.cov[:3, 0, 0] < measured["lines"]["exact", jacobians][0].cov[:3, 0, 0])
 
@@ -254,7 +259,8 @@ def lines() -> Lines:
         anchor=jnp.asarray(random.uniform(-20, 20, (k, 2))),
         offset=jnp.asarray(random.uniform(-0.1, 0.1, k)),
         angle=jnp.asarray(random.uniform(-np.pi, np.pi, k)),
-        cov=jnp.asarray(1e-3 * half @ half.transpose(0, 2, 1) + 1e-4 * np.eye(2)),
+        cov_independent=jnp.asarray(1e-3 * half @ half.transpose(0, 2, 1) + 1e-4 * np.eye(2)),
+        sqrt_persistent=jnp.asarray(0.03 * random.standard_normal((k, 2, 3))),
         extent=jnp.asarray(np.sort(random.uniform(-3, 3, (k, 2)), 1)),
         valid=jnp.ones(k, bool),
     )
@@ -297,4 +303,5 @@ def test_reanchor_leaves_the_line_where_it_is(lines: Lines) -> None:
     for after, before in zip(rho_theta(moved), rho_theta(lines), strict=True):
         np.testing.assert_allclose(after, before, rtol=1e-9, atol=1e-11)
     back = reanchor(moved, lines.anchor)
-    np.testing.assert_allclose(back.cov, lines.cov, rtol=1e-8, atol=1e-12)
+    np.testing.assert_allclose(back.cov_independent, lines.cov_independent, rtol=1e-8, atol=1e-12)
+    np.testing.assert_allclose(back.sqrt_persistent, lines.sqrt_persistent, rtol=1e-8, atol=1e-12)

@@ -76,7 +76,7 @@ def lines_of(*segments: Any, capacity: int = 6) -> Lines:
             lines,
             anchor=lines.anchor.at[i].set((begin + end) / 2),
             angle=lines.angle.at[i].set(np.arctan2(tangent[1], tangent[0]) - np.pi / 2),
-            cov=lines.cov.at[i].set(jnp.diag(jnp.array([1e-5, 1e-5]))),
+            cov_independent=lines.cov_independent.at[i].set(jnp.diag(jnp.array([1e-5, 1e-5]))),
             extent=lines.extent.at[i].set(jnp.array([-half, half])),
             var_extent=lines.var_extent.at[i].set(1e-4),
             times_detected=lines.times_detected.at[i].set(1),

@@ -41,7 +41,8 @@ def random_map(dtype: str, lines: int = 5, circles: int = 4, free: int = 2) -> L
             anchor=number(rng.uniform(-50, 50, (k, 2))),
             offset=number(rng.normal(size=k) * 1e-6),
             angle=number(rng.uniform(-np.pi, np.pi, k)),
-            cov=number(cov_l),
+            cov_independent=number(cov_l),
+            sqrt_persistent=number(rng.normal(size=(k, 2, 3)) * [[0.02], [0.005]]),
             extent=number(np.sort(rng.uniform(-4, 4, (k, 2)))),
             var_extent=number(rng.uniform(0, 1e-3, (k, 2))),
             times_detected=jnp.asarray(rng.integers(1, 40, k), jnp.int32),
@@ -50,7 +51,8 @@ def random_map(dtype: str, lines: int = 5, circles: int = 4, free: int = 2) -> L
         circles=Circles(
             center=number(rng.uniform(-50, 50, (c, 2))),
             radius=number(rng.uniform(0.02, 0.2, c)),
-            cov=number(cov_c * fitted[:, None, None]),
+            cov_independent=number(cov_c * fitted[:, None, None]),
+            sqrt_persistent=number(rng.normal(size=(c, 3, 3)) * [[0.02], [0.02], [0.0]] * fitted[:, None, None]),
             fitted=jnp.asarray(fitted),
             times_detected=jnp.asarray(rng.integers(1, 40, c), jnp.int32),
             valid=jnp.asarray(slot_c),
@@ -110,7 +112,8 @@ def test_the_file_as_other_tools_see_it(tmp_path: Path) -> None:
     lines = dataclasses.replace(
         empty_lines(2, jnp.float32),
         anchor=jnp.array([[0, 0], [2, 1]], jnp.float32),
-        cov=jnp.array([[[1, 0], [0, 1]], [[4e-4, 1e-5], [1e-5, 1e-6]]], jnp.float32),
+        cov_independent=jnp.array([[[1, 0], [0, 1]], [[4e-4, 1e-5], [1e-5, 1e-6]]], jnp.float32),
+        sqrt_persistent=jnp.array([np.zeros((2, 3)), [[0.02, 0, 0], [0, 0, 0]]], jnp.float32),
         extent=jnp.array([[0, 0], [-2, 2]], jnp.float32),
         times_detected=jnp.array([0, 7]),
         valid=jnp.array([False, True]),
@@ -119,7 +122,8 @@ def test_the_file_as_other_tools_see_it(tmp_path: Path) -> None:
         empty_circles(2, jnp.float32),
         center=jnp.array([[1, 2], [3, 4]], jnp.float32),
         radius=jnp.array([0.25, 0.5], jnp.float32),
-        cov=jnp.array([np.eye(3), np.zeros((3, 3))], jnp.float32),
+        cov_independent=jnp.array([np.eye(3), np.zeros((3, 3))], jnp.float32),
+        sqrt_persistent=jnp.array([2 * np.eye(3), np.zeros((3, 3))], jnp.float32),
         fitted=jnp.array([True, False]),
         times_detected=jnp.array([1, 2]),
         valid=jnp.array([True, True]),
@@ -132,12 +136,17 @@ def test_the_file_as_other_tools_see_it(tmp_path: Path) -> None:
     (line,) = found["lines"]
     assert (line["rho"], line["theta"], line["begin"], line["end"]) == (2.0, 0.0, [2.0, -1.0], [2.0, 3.0])
     # d rho = d offset + (tangent . anchor) d theta, and the tangent's share of the anchor is 1 m
-    expected = [[4e-4 + 2 * 1e-5 + 1e-6, 1e-5 + 1e-6], [1e-5 + 1e-6, 1e-6]]
+    expected = [[8e-4 + 2 * 1e-5 + 1e-6, 1e-5 + 1e-6], [1e-5 + 1e-6, 1e-6]]
     np.testing.assert_allclose(line["cov"], expected, rtol=1e-6)
     assert (line["times_detected"], line["anchor"], line["offset"], line["angle"]) == (7, [2.0, 1.0], 0.0, 0.0)
-    assert (line["cov_local"], line["extent"]) == ([[0.0004, 1e-05], [1e-05, 1e-06]], [-2.0, 2.0])
+    assert (line["cov_local"], line["extent"]) == ([[0.0008, 1e-05], [1e-05, 1e-06]], [-2.0, 2.0])
+    assert line["cov_independent"] == [[0.0004, 1e-05], [1e-05, 1e-06]]
+    assert line["sqrt_persistent"] == [[0.02, 0, 0], [0, 0, 0]]
     pole, cluster = found["circles"]
-    assert pole == {"center": [1, 2], "radius": 0.25, "times_detected": 1, "cov": np.eye(3).tolist()}
+    covariances = {"cov": 5 * np.eye(3), "cov_independent": np.eye(3), "sqrt_persistent": 2 * np.eye(3)}
+    assert pole == {"center": [1, 2], "radius": 0.25, "times_detected": 1} | {
+        name: matrix.tolist() for name, matrix in covariances.items()
+    }
     assert cluster == {"center": [3, 4], "radius": 0.5, "times_detected": 2}
     # one line of text for each primitive
     assert sum('"rho"' in row for row in text.splitlines()) == 1
@@ -187,8 +196,9 @@ def test_refuses_an_older_file(tmp_path: Path) -> None:
 def test_writes_nothing_that_could_not_be_read(tmp_path: Path) -> None:
     good = random_map("float32", free=0)
     nan = dataclasses.replace(good.lines, offset=good.lines.offset.at[2].set(jnp.nan))
-    singular = dataclasses.replace(good.lines, cov=good.lines.cov.at[1].set(0))
-    for lines, cause in ((nan, r"lines\[2\]\.rho is not finite"), (singular, r"lines\[1\]\.cov is not symmetric pos")):
+    singular = dataclasses.replace(good.lines, cov_independent=good.lines.cov_independent.at[1].set(0))
+    causes = (r"lines\[2\]\.rho is not finite", r"lines\[1\]\.cov_independent is not symmetric pos")
+    for lines, cause in zip((nan, singular), causes, strict=True):
         with pytest.raises(MapFileError, match=rf"^cannot write .*map\.json: {cause}"):
             write_map(tmp_path / "map.json", LineMap(lines=lines, circles=good.circles), {})
     with pytest.raises(MapFileError, match=r"settings\.noise\.sigma\[1\] is not finite"):
@@ -254,11 +264,20 @@ DAMAGES = [
     (_set("lines", 0, "offset", True), "lines[0].offset must be a number"),
     (_set("lines", 0, "offset", None), "lines[0].offset must be a number"),
     (_set("lines", 0, "cov_local", [[1.0, 0.0], [0.0]]), "lines[0].cov_local must be 2 by 2 numbers"),
+    (_set("lines", 0, "sqrt_persistent", [[1.0, 0.0], [0.0, 1.0]]), "lines[0].sqrt_persistent must be 2 by 3 numbers"),
+    (_drop("lines", 0, "cov_independent"), 'lines[0] has no "cov_independent"'),
+    (_set("lines", 2, "cov_independent", NOT_POSITIVE), "lines[2].cov_independent is not symmetric positive definite"),
+    (_set("lines", 2, "cov_independent", NOT_SYMMETRIC), "lines[2].cov_independent is not symmetric positive definite"),
     (_set("lines", 0, "offset", 1e39), "lines[0].offset is not finite in float32"),
     (_set("lines", 0, "offset", 10**400), "lines[0].offset is not finite in float32"),
     (_set("lines", 2, "cov_local", NOT_POSITIVE), "lines[2].cov_local is not symmetric positive definite"),
     (_set("lines", 2, "cov_local", NOT_SYMMETRIC), "lines[2].cov_local is not symmetric positive definite"),
     (_set("lines", 2, "cov_local", [[0.0, 0.0], [0.0, 1.0]]), "lines[2].cov_local is not symmetric positive definite"),
+    (_drop("circles", 0, "sqrt_persistent"), 'circles[0] has no "sqrt_persistent"'),
+    (
+        _set("circles", 0, "cov_independent", np.zeros((3, 3)).tolist()),
+        "circles[0].cov_independent is not symmetric pos",
+    ),
     (_set("lines", 2, "cov", NOT_POSITIVE), "lines[2].cov is not symmetric positive definite"),
     (_set("circles", 0, "cov", np.diag([1.0, 1.0, -1.0]).tolist()), "circles[0].cov is not symmetric positive"),
     (_set("circles", 0, "cov", np.zeros((3, 3)).tolist()), "circles[0].cov is not symmetric positive definite"),

@@ -31,7 +31,8 @@ def some_map(lines: int = 6, circles: int = 4, size: float = 10.0) -> LineMap:
             anchor=number(rng.uniform(0, size, (lines, 2))),
             offset=number(rng.normal(size=lines) * 0.1),
             angle=number(rng.uniform(-3, 3, lines)),
-            cov=number(root @ np.swapaxes(root, -1, -2) + np.eye(2) * 1e-5),
+            cov_independent=number(root @ np.swapaxes(root, -1, -2) + np.eye(2) * 1e-5),
+            sqrt_persistent=number(rng.normal(size=(lines, 2, 3)) * [[0.02], [0.01]]),
             extent=number(np.sort(rng.uniform(-2, 2, (lines, 2)))),
             var_extent=number(np.full((lines, 2), 1e-4)),
             times_detected=jnp.asarray(rng.integers(1, 40, lines), jnp.int32),
@@ -40,7 +41,8 @@ def some_map(lines: int = 6, circles: int = 4, size: float = 10.0) -> LineMap:
         circles=Circles(
             center=number(rng.uniform(0, size, (circles, 2))),
             radius=number(rng.uniform(0.03, 0.2, circles)),
-            cov=number(np.eye(3) * 1e-4 * fitted[:, None, None]),
+            cov_independent=number(np.eye(3) * 1e-4 * fitted[:, None, None]),
+            sqrt_persistent=number(np.diag([0.02, 0.01, 0.0]) * fitted[:, None, None]),
             fitted=jnp.asarray(fitted),
             times_detected=jnp.asarray(rng.integers(1, 40, circles), jnp.int32),
             valid=jnp.ones(circles, bool),
@@ -55,7 +57,7 @@ def box(width: float, height: float) -> LineMap:
         empty_lines(4, jnp.float32),
         anchor=number([[width, height / 2], [width / 2, height], [0, height / 2], [width / 2, 0]]),
         angle=number(np.arange(4) * np.pi / 2),
-        cov=number(np.broadcast_to(np.eye(2) * 1e-6, (4, 2, 2))),
+        cov_independent=number(np.broadcast_to(np.eye(2) * 1e-6, (4, 2, 2))),
         extent=number(np.stack([-half, half], -1)),
         times_detected=jnp.full(4, 3),
         valid=jnp.ones(4, bool),
@@ -189,7 +191,7 @@ def test_free_slots_and_what_is_not_finite_leave_no_trace() -> None:
     lines = dataclasses.replace(
         good.lines,
         anchor=good.lines.anchor.at[1].set(1e6).at[2].set(jnp.nan),
-        cov=good.lines.cov.at[3].set(jnp.inf),
+        cov_independent=good.lines.cov_independent.at[3].set(jnp.inf),
         valid=good.lines.valid.at[1].set(False),
     )
     circles = dataclasses.replace(good.circles, radius=good.circles.radius.at[0].set(jnp.nan))
