@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import json
 import os
+import shutil
 import sys
 import time
 from collections.abc import Iterator
@@ -91,6 +92,14 @@ class Demo:
     """No progress, no warnings."""
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Verify:
+    """Check the paper, equation by equation: derivatives by hand and by autodiff, and where the print is wrong."""
+
+    json: bool = False
+    """Print the table, with every single check, as JSON."""
+
+
 DEMO_NOISE = {"range_sigma": 0.015, "bearing_sigma": 0.0005, "pose_sigma": (0.01, 0.01, 0.002)}
 """What the demo log was made with."""
 
@@ -115,12 +124,14 @@ def main(args: list[str] | None = None) -> int:
       args: the arguments; those of the process unless given.
 
     Returns:
-      The exit status: 0; 2 for bad input, about which one sentence has been printed; 130 for an interrupt.
+      The exit status: 0; 1 if `verify` found a check that fails; 2 for bad input, about which one sentence has been
+      printed; 130 for an interrupt.
     """
     command = tyro.cli(
         Annotated[Demo, tyro.conf.subcommand("demo")]
         | Annotated[Build, tyro.conf.subcommand("build")]
-        | Annotated[Extract, tyro.conf.subcommand("extract")],
+        | Annotated[Extract, tyro.conf.subcommand("extract")]
+        | Annotated[Verify, tyro.conf.subcommand("verify")],
         prog="linemap",
         description="Maps of line segments and circles from 2D range scans, with covariances that can be believed.",
         config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
@@ -133,6 +144,8 @@ def main(args: list[str] | None = None) -> int:
     from linemap_jax.io.map_file import MapFileError
 
     try:
+        if isinstance(command, Verify):
+            return _verify(command)
         if isinstance(command, Extract):
             return _extract(command)
         return _build(_of_demo(command) if isinstance(command, Demo) else command)
@@ -291,15 +304,27 @@ def _extract(command: Extract) -> int:
     return 0
 
 
+def _verify(command: Verify) -> int:
+    _keep_compilations()
+    from linemap_jax.lab.verification import as_dict, as_text, verify
+
+    if sys.stderr.isatty():
+        print("linemap: compiles for some 20 s, the first time", file=sys.stderr)
+    rows = verify()
+    if command.json:
+        print(json.dumps([as_dict(row) for row in rows], indent=2))
+    else:
+        print(as_text(rows, width=min(shutil.get_terminal_size().columns, 120)))
+    return 0 if all(row.passed for row in rows) else 1
+
+
 def _options(command: LogOptions) -> dict[str, Any]:
     """The keyword arguments of `update`: preset, then the settings file, then the options of the command line."""
     _check(command)
     import jax
 
     jax.config.update("jax_enable_x64", command.dtype == "float64")
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # else the user has said where
-        jax.config.update("jax_compilation_cache_dir", str(_cache_folder()))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+    _keep_compilations()
     from linemap_jax.core.settings import Mount, SensorNoise, preset
     from linemap_jax.io.config import read_config
 
@@ -376,6 +401,15 @@ def _make_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"cannot make the folder {folder}: {error.strerror}") from error
+
+
+def _keep_compilations() -> None:
+    """What is compiled is kept for the next run of the command line."""
+    import jax
+
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # else the user has said where
+        jax.config.update("jax_compilation_cache_dir", str(_cache_folder()))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 
 
 def _cache_folder() -> Path:
