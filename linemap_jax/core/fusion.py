@@ -76,7 +76,7 @@ def combine(old: Errors, new: Errors, pose_error: PoseError) -> tuple[Float[Arra
         innovation = c_old + c_new + squared(difference)
     unit = inverse(symmetric(innovation))
     gain = product(before, unit)
-    keep = jnp.eye(gain.shape[-1], dtype=gain.dtype) - gain
+    keep = jnp.broadcast_to(jnp.eye(gain.shape[-1], dtype=gain.dtype), gain.shape) - gain
     independent = propagate(keep, c_old) + propagate(gain, c_new)
     a_old, a_new = product(keep, a_old), product(gain, a_new)
     if pose_error == "unknown":
@@ -294,7 +294,7 @@ def _or_neutral(errors: Errors, meant: Bool[Array, "K 1 1"]) -> Errors:
     """The errors that are meant; elsewhere some that give no NaN."""
     eye = jnp.eye(errors.cov_independent.shape[-1], dtype=errors.cov_independent.dtype)
     return Errors(
-        cov_independent=jnp.where(meant, errors.cov_independent, eye),
+        cov_independent=jnp.where(meant, errors.cov_independent, eye[None]),
         sqrt_persistent=jnp.where(meant, errors.sqrt_persistent, 0),
         times_detected=jnp.where(meant[:, 0, 0], errors.times_detected, 1),
     )

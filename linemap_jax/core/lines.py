@@ -256,7 +256,7 @@ def without_corner_points(points: Points, runs: Runs, noise: SensorNoise) -> Run
 
     Just past a corner, points of the next wall still pass criterion 2. At an end of a run, a point that lies within
     `CORNER_SIGMAS` of the line next to it in the sweep is left out of the fit, with all points beyond it; unless these
-    are many, as where two pieces of one wall follow each other.
+    are more than a third, as where two pieces of one wall follow each other, or too few would be left.
 
     Args:
       points: the points of the scan.
@@ -268,6 +268,7 @@ def without_corner_points(points: Points, runs: Runs, noise: SensorNoise) -> Run
     normal, middle = perp(fit.direction) / jnp.sqrt(length2)[:, None], fit.origin + fit.centroid
     index = jnp.arange(runs.of_point.shape[0])
     count = runs.valid.shape[0]
+    most = jnp.minimum(fit.count / 3, (fit.count - MIN_POINTS) / 2)
     kept = runs.of_point >= 0
     for side in (-1, 1):
         # The line beside each run, in front of its first point or behind its last one
@@ -282,7 +283,7 @@ def without_corner_points(points: Points, runs: Runs, noise: SensorNoise) -> Run
         mine = (runs.of_point[None] == jnp.arange(count)[:, None]) & far[None]
         outermost = jnp.max(jnp.where(mine, side * index[None], -index.shape[0]), -1)
         last = jnp.where(side > 0, runs.last, -runs.first)
-        trims = exists & (last - outermost <= fit.count / 3)
+        trims = exists & (last - outermost <= most)
         kept = kept & ~(trims[runs.of_point] & (side * index > outermost[runs.of_point]))
     return dataclasses.replace(runs, of_point=jnp.where(kept, runs.of_point, -1))
 

@@ -118,11 +118,11 @@ def update(
 
     if pose_error == "persistent":
         # A scan without returns is none, so that a chunk may be filled up with such.
-        correlation = jnp.where(jnp.any(scan.valid), lasting.correlation, 1)
+        kept = jnp.where(jnp.any(scan.valid), jnp.square(lasting.correlation), 1)
         line_map = dataclasses.replace(
             line_map,
-            lines=fusion.forget(line_map.lines, correlation**2),
-            circles=fusion.forget(line_map.circles, correlation**2),
+            lines=fusion.forget(line_map.lines, kept),
+            circles=fusion.forget(line_map.circles, kept),
         )
     lines = _update_lines(line_map.lines, found, thresholds, rules, pose_error, lasting.share)
     swept = _sweep(line_map.circles, lines, found, points, pose, thresholds, noise, rules)

@@ -13,6 +13,7 @@ Three experiments, each a function of a key that makes one run; map them over ke
 
 import dataclasses
 import enum
+import itertools
 import math
 from collections.abc import Sequence
 from statistics import NormalDist
@@ -42,9 +43,10 @@ from linemap_jax.core.settings import (
     persistence_of,
 )
 from linemap_jax.core.state import Lines, Pose, Scan, empty_lines, pytree
+from linemap_jax.lab.generators import room
 from linemap_jax.lab.raycast import cast
-from linemap_jax.lab.scanners import Scanner, noise_of, simulate_scan
-from linemap_jax.lab.world import World
+from linemap_jax.lab.scanners import Scanner, noise_of, simulate_scan, sweep
+from linemap_jax.lab.world import Kind, World, polygon
 
 CHI2_95 = -2 * math.log(0.05)
 """95 % quantile of chi-square with 2 degrees of freedom."""
@@ -86,8 +88,8 @@ def nees(error: Float[Array, "*s n"], cov: Float[Array, "*s n n"]) -> Float[Arra
 class Sample(NamedTuple):
     """What one run has to say."""
 
-    nees: Array
-    counts: Array  # false where nothing was found
+    nees: Any
+    counts: Any  # false where nothing was found
 
 
 class Fit(enum.Enum):
@@ -154,10 +156,10 @@ def pipeline(
     lines, count = found.lines, seen.shape[0]
     beams = (found.line_of_beam[:, None] == jnp.arange(lines.valid.shape[0])[None]).astype(jnp.float32)
     met = (truth.thing[:, None] == jnp.arange(count)[None]).astype(jnp.float32)
-    of_line = jnp.argmax(jnp.dot(beams.T, met), -1)
+    of_line = jnp.argmax(jnp.einsum("nl,nw->lw", beams, met), -1)
     wall = jax.tree.map(lambda x: x[of_line], walls_of(world))
     errors = nees(line_error(lines, wall), lines.cov)
-    length = jnp.where(lines.valid & (of_line == which), lines.length, 0)
+    length = jnp.asarray(jnp.where(lines.valid & (of_line == which), lines.length, 0))
     longest = jnp.argmax(length)
     return Sample(errors[longest], length[longest] > 0), Sample(errors, lines.valid)
 
@@ -300,6 +302,56 @@ def _normal(key: Array, cov: Float[Array, "3 3"]) -> Float[Array, "3"]:
     return square_root(cov) @ jax.random.normal(key, (3,), cov.dtype)
 
 
+@pytree
+class Cell:
+    """One configuration of a table."""
+
+    world: World
+    path: Float[Array, "T 3"]  # true poses; the first one is where single scans are taken
+    scanner: Scanner
+    cov_pose: Float[Array, "3 3"]
+
+
+def cells() -> dict[str, Cell]:
+    """The 264 configurations that covariances are judged by, by name.
+
+    Walls of 8 m and 2 m ahead of the scanner at 2, 5 and 10 m, with normals at 0, 30 and 60 degrees; a room of 12 m by
+    12 m, straight and turned by 20 degrees, from its middle and from aside; 1 and 3 cm of noise in range; none and 0.1
+    degree in bearing; a pose that is exact, and one that is uncertain by 1 cm and 0.2 degree, or 5 cm and 1 degree. On
+    the path the robot moves by half a metre and turns by 15 degrees. 361 beams over 180 degrees.
+    """
+    t = np.linspace(0, 1, 50)
+    path = np.stack([0.5 * np.sin(4 * t), 0.3 * np.sin(6 * t), 0.25 * np.sin(5 * t)], -1)
+    scenes: dict[str, tuple[World, tuple[float, float]]] = {}
+    for distance, degrees, length in itertools.product((2, 5, 10), (0, 30, 60), (8, 2)):
+        along = length / 2 * np.array([-math.sin(math.radians(degrees)), math.cos(math.radians(degrees))])
+        ends = np.array([[distance, 0.0]]) + np.array([[-1.0], [1.0]]) * along
+        name = f"wall of {length} m at {distance} m, {degrees} degrees"
+        scenes[name] = polygon(jnp.asarray(ends), Kind.WALL), (0.0, 0.0)
+    for degrees, (where, offset) in itertools.product((0, 20), {"middle": (0.0, 0.0), "aside": (3.0, 2.0)}.items()):
+        scenes[f"room turned by {degrees} degrees, from {where}"] = room(12.0, 12.0, math.radians(degrees)), offset
+    poses = {
+        "exact pose": (0.0, 0.0),
+        "pose 1 cm, 0.2 degree": (0.01, math.radians(0.2)),
+        "pose 5 cm, 1 degree": (0.05, math.radians(1)),
+    }
+    return {
+        f"{scene}; {sigma_r} m, {degrees} degree; {pose}": Cell(
+            world=world,
+            path=jnp.asarray(path + np.array([*offset, 0.0])),
+            scanner=Scanner(
+                bearings=sweep(-math.pi / 2, math.pi / 2, 361),
+                range_sigma=jnp.asarray(sigma_r),
+                bearing_sigma=jnp.asarray(math.radians(degrees)),
+            ),
+            cov_pose=jnp.diag(jnp.asarray([position, position, heading]) ** 2),
+        )
+        for (scene, (world, offset)), sigma_r, degrees, (pose, (position, heading)) in itertools.product(
+            scenes.items(), (0.01, 0.03), (0.0, 0.1), poses.items()
+        )
+    }
+
+
 class Verdict(NamedTuple):
     """What many runs say of one configuration."""
 
@@ -315,7 +367,8 @@ def judge(sample: Sample) -> Verdict:
     Raises:
       ValueError: if there is no run that counts.
     """
-    values = np.asarray(sample.nees)[np.asarray(sample.counts)]
+    values = np.asarray(sample.nees)
+    values = values[np.broadcast_to(np.asarray(sample.counts), values.shape)]
     if not values.size:
         raise ValueError("no run has found a line")
     inside = float(np.mean(values < CHI2_95))
@@ -346,3 +399,9 @@ def bands(runs: int, cells: int = 1, *, error: float = 0.001, dof: int = 2) -> B
     low, high = (k * (1 - 2 / (9 * k) + s * z * math.sqrt(2 / (9 * k))) ** 3 / runs for s in (-1, 1))
     spread = z * math.sqrt(0.05 * 0.95 / runs)
     return Bands((low, high), (0.95 - spread, 0.95 + spread))
+
+
+def holds(verdict: Verdict, band: Bands) -> bool:
+    """Whether mean and coverage lie in their bands."""
+    in_mean = band.mean[0] <= verdict.mean <= band.mean[1]
+    return in_mean and band.inside[0] <= verdict.inside <= band.inside[1]
