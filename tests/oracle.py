@@ -32,6 +32,12 @@ EDGE_ON = 1e-3
 GRAZING = 0.1
 GAUSS_NEWTON_STEPS = 5
 FEWEST_CIRCLE_POINTS = 5
+# Points closer than this (sigmas) to the line beside their own may be that line's.
+CORNER_SIGMAS = 3.0
+# A beam more grazing than this (cosine of the incidence) does not say where it meets a line.
+SHALLOW = 0.02
+# What a scan says of a pose error that persists is known to this part: it depends on the pose.
+JACOBIAN_ERROR = 0.01
 # Points whose scatter is flatter than this have no circle: determinant of the scatter over its squared trace.
 FLAT = 1e-6
 
@@ -249,6 +255,65 @@ def distance_to_segments(point: np.ndarray, lines: Lines) -> np.ndarray:
     return np.hypot(*(point - lines.point_at(s)).T)
 
 
+def seen_from(lines: Any, anchor: np.ndarray, keep: np.ndarray) -> Lines:
+    """The lines of the package at `keep`, relative to other anchors, in float64. `anchor` has the shape `[K, 2]`."""
+    fields = {field.name: np.asarray(getattr(lines, field.name))[keep] for field in dataclasses.fields(Lines)}
+    here = Lines(**{name: x.astype(float) if x.dtype.kind == "f" else x for name, x in fields.items()})
+    step = here.anchor - anchor
+    along = dot(here.tangent, step)
+    s = lever_matrix(along)
+    return dataclasses.replace(
+        here,
+        anchor=anchor,
+        offset=here.offset + dot(here.normal, step),
+        cov_independent=sandwich(s, here.cov_independent),
+        sqrt_persistent=s @ here.sqrt_persistent,
+        extent=here.extent + along[:, None],
+    )
+
+
+def differences(mine: Any, theirs: Lines, keep: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How far lines of the package are from those of the oracle, at the oracle's anchors.
+
+    Args:
+      mine: lines of the package.
+      theirs: lines of the oracle. Length `K`.
+      keep: which of the package's these are.
+
+    Returns:
+      The larger difference of offset (m) and angle (rad), shape `[K]`; and the differences of both parts of the
+      covariance, relative to the whole of it (Frobenius), shape `[2, K]`.
+    """
+    moved = seen_from(mine, theirs.anchor, keep)
+    turn = np.abs(wrap(moved.angle - theirs.angle))
+    estimate = np.maximum(np.abs(moved.offset - theirs.offset), turn)
+    independent = moved.cov_independent - theirs.cov_independent
+    persistent = squared(moved.sqrt_persistent) - squared(theirs.sqrt_persistent)
+    scale = np.linalg.norm(theirs.cov, axis=(1, 2))
+    return estimate, np.stack([np.linalg.norm(part, axis=(1, 2)) / scale for part in (independent, persistent)])
+
+
+def without_counterpart(lines: Lines, others: Lines, *, within: float = 0.05, share: float = 0.5) -> np.ndarray:
+    """Which valid lines of one map the other map does not hold. Shape `[K]`, of the valid lines alone.
+
+    A line has a counterpart if there is one line of the other map that runs along at least this share of it, nowhere
+    farther away than `within` (m).
+    """
+    mine, theirs = lines.take(np.flatnonzero(lines.valid)), others.take(np.flatnonzero(others.valid))
+    alone = np.ones(len(mine.offset), bool)
+    for i in range(len(alone)):
+        ends = np.stack([theirs.begin, theirs.end], 1) - mine.anchor[i]
+        s, d = ends @ mine.tangent[i], ends @ mine.normal[i] - mine.offset[i]
+        # The stretch of mine beside each of theirs, and how far away theirs is at both of its ends.
+        stretch = np.clip(s, *mine.extent[i])
+        length = np.abs(stretch[:, 1] - stretch[:, 0])
+        run = s[:, 1] - s[:, 0]
+        slope = (d[:, 1] - d[:, 0]) / np.where(run == 0, 1.0, run)
+        away = np.abs(d[:, :1] + slope[:, None] * (stretch - s[:, :1])).max(-1)
+        alone[i] = not ((length >= share * (mine.extent[i, 1] - mine.extent[i, 0])) & (away <= within)).any()
+    return alone
+
+
 def _numbers(settings: Any) -> Any:
     """The fields of a settings object as plain floats, which are many times faster than arrays of one number."""
     return SimpleNamespace(**{f.name: float(getattr(settings, f.name)) for f in dataclasses.fields(settings)})
@@ -387,8 +452,11 @@ class Regression(NamedTuple):
         return float(wrap(math.atan2(self.sign * along[1], self.sign * along[0]) - math.pi / 2))
 
 
-def regression(points: np.ndarray) -> Regression:
-    """Eqs. (5)-(8), with sums relative to the first point. The points have shape `[n, 2]`."""
+def regression(points: np.ndarray, towards: np.ndarray | None = None) -> Regression:
+    """Eqs. (5)-(8), with sums relative to the first point. The points have shape `[n, 2]`.
+
+    The line runs `towards` a direction, from the first to the last point unless given.
+    """
     n = len(points)
     x, y = (points - points[0]).T
     rx, ry, rxx, ryy, rxy = x.sum(), y.sum(), (x * x).sum(), (y * y).sum(), (x * y).sum()
@@ -397,7 +465,7 @@ def regression(points: np.ndarray) -> Regression:
     width = n2 if steep else n1
     slope = tt / width if width > 0 else 0.0
     direction = (slope, 1.0) if steep else (1.0, slope)
-    sign = 1.0 if direction @ (points[-1] - points[0]) >= 0 else -1.0
+    sign = 1.0 if direction @ (points[-1] - points[0] if towards is None else towards) >= 0 else -1.0
     return Regression(bool(steep), float(slope), sign, points[0] + np.array([rx, ry]) / n)
 
 
@@ -411,7 +479,7 @@ def line_from_points(points: np.ndarray, anchor: np.ndarray) -> np.ndarray:
     return np.array([normal @ (line.centroid - anchor), line.angle])
 
 
-def jac_line_points(points: np.ndarray, anchor: np.ndarray) -> np.ndarray:
+def jac_line_points(points: np.ndarray, anchor: np.ndarray, towards: np.ndarray | None = None) -> np.ndarray:
     """J, d(offset, angle) / d(point) for each point at a fixed anchor; Eqs. (11)-(17) without their misprints.
 
     With x, y relative to the anchor, w = sqrt(1 + slope^2), and a bar for a mean, the line is
@@ -424,11 +492,12 @@ def jac_line_points(points: np.ndarray, anchor: np.ndarray) -> np.ndarray:
     Args:
       points: the points of the run. Shape `[n, 2]`.
       anchor: a point in the same frame. Shape `[2]`.
+      towards: as for `regression`.
 
     Returns:
       The Jacobians. Shape `[n, 2, 2]`.
     """
-    line = regression(points)
+    line = regression(points, towards)
     n, k, sign = len(points), line.slope, line.sign
     w = math.sqrt(1 + k * k)
     x_bar, y_bar = line.centroid - anchor
@@ -455,42 +524,131 @@ def jac_line_points(points: np.ndarray, anchor: np.ndarray) -> np.ndarray:
     return h @ np.stack([slope_by, const_by], 1)
 
 
-def _line_of_run(
-    sweep: Sweep, run: list[int], *, covariance: str, min_length: float, margin: Margin
-) -> dict[str, Any] | None:
-    """The fields of one line from its points: estimate, end points, covariance; s4.2.3-4.2.5. None if too short."""
-    o, r, u = sweep.o[run], sweep.r[run], sweep.u[run]
-    line = regression(o)
-    anchor = sweep.p + line.centroid
+def length_of_run(points: np.ndarray) -> float:
+    """From the foot of the first point to that of the last one on their line, m. The points have shape `[n, 2]`."""
+    angle = regression(points).angle
+    return float(np.array([-math.sin(angle), math.cos(angle)]) @ (points[-1] - points[0]))
+
+
+def without_corners(sweep: Sweep, runs: list[list[int]], margin: Margin) -> list[list[int]]:
+    """The points of each run that no line beside it can claim.
+
+    At an end of a run, points may be the next line's that still passed criterion 2. They are left out up to the first
+    one that is surely none, unless they are more than a third, or both ends together might leave fewer than three.
+
+    Args:
+      sweep: the valid beams.
+      runs: those that are lines, in their order, each a list of positions in the sweep.
+      margin: notes how clear the decisions were.
+    """
+    lines = [regression(sweep.o[run]) for run in runs]
+    result = []
+    for k, run in enumerate(runs):
+        begin, end = 0, len(run)
+        for side in (-1, 1):
+            if not 0 <= k + side < len(runs):
+                continue
+            beside = lines[k + side]
+            normal = np.array([math.cos(beside.angle), math.sin(beside.angle)])
+            cos2 = (sweep.u[run] @ normal) ** 2
+            sigma = np.sqrt(sweep.sr**2 * cos2 + (sweep.r[run] * sweep.sa) ** 2 * (1 - cos2))
+            across = np.abs((sweep.o[run] - beside.centroid) @ normal)
+            own = [i for i in range(len(run)) if margin.below(CORNER_SIGMAS * float(sigma[i]), float(across[i]))]
+            beyond = (own[0] if side < 0 else len(run) - 1 - own[-1]) if own else len(run)
+            if 3 * beyond <= len(run) and 2 * beyond <= len(run) - 3:
+                begin, end = (beyond, end) if side < 0 else (begin, len(run) - beyond)
+        result.append(run[begin:end])
+    return result
+
+
+def likeliest_line(
+    points: np.ndarray,
+    u: np.ndarray,
+    r: np.ndarray,
+    anchor: np.ndarray,
+    line: tuple[float, float],
+    *,
+    laser: np.ndarray,
+    sr: float,
+    sa: float,
+) -> tuple[tuple[float, float], np.ndarray]:
+    """One Gauss-Newton step towards the most likely line: noise lies along the beams, and a little across them.
+
+    Args:
+      points: the points. Shape `[n, 2]`.
+      u: directions of their beams. Shape `[n, 2]`.
+      r: ranges, m. Shape `[n]`.
+      anchor: in the frame of the points. Shape `[2]`.
+      line: offset and angle, to start from.
+      laser: the scanner in the same frame. Shape `[2]`.
+      sr: sigma of a range, m.
+      sa: sigma of a bearing, rad.
+
+    Returns:
+      Offset and angle, and their Jacobians by the points, shape `[n, 2, 2]`.
+    """
+    offset, angle = line
+    normal = np.array([math.cos(angle), math.sin(angle)])
+    tangent = np.array([-normal[1], normal[0]])
+    information, vector, weighted = np.zeros((2, 2)), np.zeros(2), []
+    for point, beam, reach in zip(points, u, r, strict=True):
+        cos = float(normal @ beam)
+        # Where the beam meets the line, not where its noise has put the point.
+        rho = (offset + normal @ (anchor - laser)) / cos if abs(cos) > SHALLOW else reach
+        s = tangent @ (laser + rho * beam - anchor)
+        cos2 = max(cos**2, SHALLOW**2)
+        row = np.array([1.0, -s])
+        weighted.append(row / (sr**2 * cos2 + (rho * sa) ** 2 * (1 - cos2)))
+        information += np.outer(weighted[-1], row)
+        vector += weighted[-1] * (normal @ (point - anchor) - offset)
+    change = np.linalg.solve(information, vector)
+    gain = np.linalg.solve(information, np.array(weighted).T).T
+    return (offset + change[0], float(wrap(angle + change[1]))), gain[:, :, None] * normal
+
+
+def _line_of_run(sweep: Sweep, run: list[int], kept: list[int], *, covariance: str, rules: Any) -> dict[str, Any]:
+    """The fields of one line from its points: estimate, end points, covariance; s4.2.3-4.2.5.
+
+    The ends are those of the run, the rest comes from the points that are kept.
+    """
+    first, last = sweep.o[run[0]], sweep.o[run[-1]]
+    o, r, u = sweep.o[kept], sweep.r[kept], sweep.u[kept]
+    fit = regression(o, last - first)
+    anchor = sweep.p + fit.centroid
     # What the rounded anchor misses of the centroid goes into the offset.
     here = anchor - sweep.p
-    normal = np.array([math.cos(line.angle), math.sin(line.angle)])
+    angle = fit.angle
+    offset = float(np.array([math.cos(angle), math.sin(angle)]) @ (fit.centroid - here))
+    if rules.maximum_likelihood:
+        sensor = {"laser": sweep.laser, "sr": sweep.sr, "sa": sweep.sa}
+        (offset, angle), j = likeliest_line(o, u, r, here, (offset, angle), **sensor)
+    else:
+        j = jac_line_points(o, here, last - first)
+    normal = np.array([math.cos(angle), math.sin(angle)])
     tangent = np.array([-normal[1], normal[0]])
-    offset = normal @ (line.centroid - here)
-    extent = np.array([tangent @ (o[0] - here), tangent @ (o[-1] - here)])
-    if not margin.below(min_length, extent[1] - extent[0]):
-        return None
+    extent = np.array([tangent @ (first - here), tangent @ (last - here)])
 
     f, g = jac_point_pose(o), jac_point_measurement(r, u)
-    cov_sensor = sandwich(g, np.diag([sweep.sr**2, sweep.sa**2]))
-    cov_points = sandwich(f, sweep.cov_pose) + cov_sensor
-    j = jac_line_points(o, here)
+    c_s = np.diag([sweep.sr**2, sweep.sa**2])
     if covariance == "printed":
         # Departure that the paper makes, not we: Eq. (12) sums the pose error as if each point had its own.
+        cov_points = sandwich(f, sweep.cov_pose) + sandwich(g, c_s)
         cov_measurement = symmetric(sandwich(j, cov_points).sum(0))
         jac_line_pose = np.zeros((2, 3))
     else:
-        cov_measurement = symmetric(sandwich(j, cov_sensor).sum(0))
+        cov_measurement = symmetric(sandwich(j, sandwich(g, c_s)).sum(0))
         jac_line_pose = (j @ f).sum(0)
 
     var_extent = np.zeros(2)
-    for side, k in ((0, 0), (1, -1)):
-        beam_on_line = sweep.spacing * r[k] / max(abs(normal @ u[k]), GRAZING)
-        var_extent[side] = tangent @ cov_points[k] @ tangent + beam_on_line**2 / 12
+    for side, k in ((0, run[0]), (1, run[-1])):
+        cov = sandwich(jac_point_pose(sweep.o[k]), sweep.cov_pose)
+        cov = cov + sandwich(jac_point_measurement(sweep.r[k], sweep.u[k]), c_s)
+        beam_on_line = sweep.spacing * sweep.r[k] / max(abs(normal @ sweep.u[k]), GRAZING)
+        var_extent[side] = tangent @ cov @ tangent + beam_on_line**2 / 12
     return {
         "anchor": anchor,
         "offset": offset,
-        "angle": line.angle,
+        "angle": angle,
         "cov_independent": cov_measurement,
         "sqrt_persistent": jac_line_pose @ lower_root(sweep.cov_pose),
         "extent": extent,
@@ -688,21 +846,23 @@ def extract(
 
     line_of_beam, circle_of_beam = np.full(total, -1), np.full(total, -1)
     in_line = np.zeros(len(sweep.beam), bool)
-    found: list[dict[str, Any]] = []
+    of_lines: list[list[int]] = []
     for run in runs:
         if len(run) < 3:
             rejected["too_few"] += len(run)
-            continue
-        line = _line_of_run(sweep, run, covariance=covariance, min_length=float(thresholds.min_length), margin=margin)
-        if line is None:
+        elif not margin.below(float(thresholds.min_length), length_of_run(sweep.o[run])):
             rejected["too_short"] += len(run)
-            continue
-        if len(found) == capacity.lines:
+        elif len(of_lines) == capacity.lines:
             status |= Status.SCAN_LINES_FULL
-            continue
-        in_line[run] = True
-        line_of_beam[sweep.beam[run]] = len(found)
-        found.append(line)
+        else:
+            in_line[run] = True
+            line_of_beam[sweep.beam[run]] = len(of_lines)
+            of_lines.append(run)
+    kept_points = without_corners(sweep, of_lines, margin) if rules.leave_out_corners else of_lines
+    found = [
+        _line_of_run(sweep, run, kept, covariance=covariance, rules=rules)
+        for run, kept in zip(of_lines, kept_points, strict=True)
+    ]
     lines = Lines(
         anchor=_stack(found, "anchor", (2,)),
         offset=_stack(found, "offset", ()),
@@ -852,7 +1012,8 @@ def cov_shared(a_new: np.ndarray, a_old: np.ndarray, pose_error: PoseError) -> n
 def combine(old: Error, new: Error, pose_error: PoseError) -> tuple[np.ndarray, Error]:
     """The static Kalman filter of Eq. (23) for errors in two parts.
 
-    "independent" and "persistent": u is a state that both share and that is not estimated (Schmidt). "unknown": each
+    "independent" and "persistent": u is a state that both share and that is not estimated (Schmidt); in "persistent"
+    what the new estimate says of u is not taken at its word. "unknown": each
     persisting part counts as if it were larger, by the inverse of its weight, which is its number of scans; and the
     covariance of their sum is bounded for every correlation, by (x + y)(x + y)^T <= (1 + b/a) x x^T + (1 + a/b) y y^T.
 
@@ -865,6 +1026,8 @@ def combine(old: Error, new: Error, pose_error: PoseError) -> tuple[np.ndarray, 
       The gain of the new estimate, and the error of the result.
     """
     one = np.eye(len(old.c))
+    if pose_error == "persistent":
+        new = new._replace(c=new.c + JACOBIAN_ERROR**2 * squared(new.a))
     if pose_error != "unknown":
         apart = new.a - old.a
         gain = (old.c - old.a @ apart.T) @ np.linalg.inv(old.c + new.c + squared(apart))

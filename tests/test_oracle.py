@@ -4,14 +4,12 @@ from functools import partial
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import oracle
 import pytest
 from real_logs import LOGS, one, scans_of
 
 from linemap_jax import Capacity, Mount, SensorNoise, empty_map, extract, preset, update
-from linemap_jax.core.frames import reanchor
 from linemap_jax.core.settings import Persistence
 from linemap_jax.core.state import LEFT_OUT
 
@@ -38,25 +36,6 @@ def extract_all(scans: Any, poses: Any, name: str, jacobians: str = "autodiff") 
     return jax.lax.map(lambda x: one_scan(*x), (scans, poses))
 
 
-def seen_from(anchor: np.ndarray, lines: Any, keep: np.ndarray) -> Any:
-    """The valid lines, relative to other anchors."""
-    return reanchor(jax.tree.map(lambda x: jnp.asarray(x[keep]), lines), jnp.asarray(anchor))
-
-
-def line_differences(mine: Any, theirs: Any, keep: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Differences at the oracle's anchors: of (offset, angle), and of both parts of the covariance, shape `[2, K]`.
-
-    Those of the covariance are relative to the whole of it (Frobenius).
-    """
-    moved = jax.tree.map(np.asarray, seen_from(theirs.anchor, mine, keep))
-    turn = np.abs((moved.angle - theirs.angle + np.pi) % (2 * np.pi) - np.pi)
-    estimate = np.maximum(np.abs(moved.offset - theirs.offset), turn)
-    independent = moved.cov_independent - theirs.cov_independent
-    persistent = oracle.squared(moved.sqrt_persistent) - oracle.squared(theirs.sqrt_persistent)
-    scale = np.linalg.norm(theirs.cov, axis=(1, 2))
-    return estimate, np.stack([np.linalg.norm(part, axis=(1, 2)) / scale for part in (independent, persistent)])
-
-
 @pytest.mark.parametrize("name", ["default", "paper"])
 @pytest.mark.parametrize("log", LOGS)
 def test_extraction_is_that_of_the_oracle(log: str, name: str) -> None:
@@ -76,7 +55,7 @@ def test_extraction_is_that_of_the_oracle(log: str, name: str) -> None:
         assert mine.status == theirs.status
 
         keep = mine.lines.valid
-        estimate, cov = line_differences(mine.lines, theirs.lines, keep)
+        estimate, cov = oracle.differences(mine.lines, theirs.lines, keep)
         np.testing.assert_array_less(estimate, 1e-9)
         np.testing.assert_array_less(cov, 1e-9)
         np.testing.assert_allclose(mine.lines.begin[keep], theirs.lines.begin, atol=1e-9)
@@ -109,8 +88,7 @@ def test_float32_extraction_is_that_of_the_oracle(log: str) -> None:
         if not np.array_equal(mine.line_of_beam, theirs.line_of_beam):
             continue
         same += 1
-        mine = jax.tree.map(lambda x: x.astype("float64") if x.dtype == np.float32 else x, mine)
-        moved = seen_from(theirs.lines.anchor, mine.lines, mine.lines.valid)
+        moved = oracle.seen_from(mine.lines, theirs.lines.anchor, mine.lines.valid)
         sigma = np.sqrt(np.diagonal(theirs.lines.cov, axis1=1, axis2=2))
         np.testing.assert_array_less(np.abs(moved.offset - theirs.lines.offset), 0.01 * sigma[:, 0])
         np.testing.assert_array_less(np.abs(moved.angle - theirs.lines.angle), 0.01 * sigma[:, 1])
@@ -168,7 +146,7 @@ def test_map_is_that_of_the_oracle_slot_by_slot(log: str, name: str, pose_error:
         np.testing.assert_array_equal(mine.lines.valid, theirs.lines.valid)
         np.testing.assert_array_equal(mine.circles.valid, theirs.circles.valid)
     keep = theirs.lines.valid
-    estimate, cov = line_differences(mine.lines, theirs.lines.take(np.flatnonzero(keep)), keep)
+    estimate, cov = oracle.differences(mine.lines, theirs.lines.take(np.flatnonzero(keep)), keep)
     np.testing.assert_array_less(estimate, 1e-8)
     np.testing.assert_array_less(cov, 1e-6)
     np.testing.assert_allclose(mine.lines.extent[keep], theirs.lines.extent[keep], atol=1e-7)
