@@ -48,16 +48,13 @@ def free_room(key: Array, *, vertices: int, size: Number = 5.0, dtype: Any = Non
     if vertices < 3:
         raise ValueError(f"a room has three corners at least, not {vertices}")
     dtype = _float(dtype)
-    of_angle, of_wave, of_phase, of_rough = jax.random.split(key, 4)
-    jitter = jax.random.uniform(of_angle, (vertices,), dtype, -0.15, 0.15)
-    angle = 2 * jnp.pi / vertices * (jnp.arange(vertices) + jitter)
-    waves = jnp.arange(2, 2 + _BUMPS)[:, None]
-    height = jax.random.uniform(of_wave, (_BUMPS, 1), dtype, -0.15, 0.15)
-    phase = jax.random.uniform(of_phase, (_BUMPS, 1), dtype, -jnp.pi, jnp.pi)
-    wave = jnp.sum(height * jnp.cos(waves * angle[None] + phase), 0)
+    draws = jax.random.uniform(key, (2 * (vertices + _BUMPS),), dtype, -1.0, 1.0)
+    off, rough, height, phase = jnp.split(draws, np.cumsum([vertices, vertices, _BUMPS]))
+    angle = 2 * jnp.pi / vertices * (jnp.arange(vertices) + 0.15 * off)
+    waves = jnp.arange(2, 2 + _BUMPS)[:, None] * angle[None] + jnp.pi * phase[:, None]
     # With many corners, single ones stick out less: else every wall would point at the origin.
-    rough = min(1.0, 12 / vertices) * jax.random.uniform(of_rough, (vertices,), dtype, -0.3, 0.3)
-    corners = (size * jnp.exp(wave + rough))[:, None] * unit(angle)
+    log_size = jnp.sum(0.15 * height[:, None] * jnp.cos(waves), 0) + 0.3 * min(1.0, 12 / vertices) * rough
+    corners = (size * jnp.exp(log_size))[:, None] * unit(angle)
     reach = _distance_to_origin(corners) / 2
     return dataclasses.replace(polygon(corners, Kind.ROOM), path=reach * unit(jnp.arange(7, dtype=dtype) * jnp.pi / 3))
 
@@ -82,26 +79,25 @@ def rectilinear_room(
     dtype = _float(dtype)
     above = (vertices + 2) // 4
     columns = (above, vertices // 2 - above)
-    of_angle, *of_sides = jax.random.split(key, 3)
     length = column * above
+    draws = jax.random.uniform(key, (2 * sum(columns) + 1,), dtype)
 
-    def side(key: Array, count: int) -> Float[Array, "K 2"]:
+    def side(draws: Float[Array, " D"]) -> Float[Array, "K 2"]:
         """The two ends of each wall along the axis, in the sense of the axis; height as distance from it."""
-        of_width, of_first, of_step = jax.random.split(key, 3)
-        width = jax.random.uniform(of_width, (count,), dtype, 0.5, 1.5)
-        at = jnp.concatenate([jnp.zeros(1, dtype), jnp.cumsum(width)]) / jnp.sum(width) * length
+        width, step = jnp.split(draws, 2)
+        at = jnp.concatenate([jnp.zeros(1, dtype), jnp.cumsum(0.5 + width)])
+        at = at / at[-1] * length
         # Steps around a ring of 1.6 m, never nearer than 0.25 m to where they came from.
-        first = jax.random.uniform(of_first, (1,), dtype, 0.0, 1.6)
-        steps = jax.random.uniform(of_step, (count - 1,), dtype, 0.25, 1.35)
-        height = 0.8 + jnp.cumsum(jnp.concatenate([first, steps])) % 1.6
+        height = 0.8 + jnp.cumsum(0.25 + 1.1 * step) % 1.6
         return jnp.stack([jnp.stack([at[:-1], height], -1), jnp.stack([at[1:], height], -1)], 1).reshape(-1, 2)
 
-    lower, upper = (side(k, n) for k, n in zip(of_sides, reversed(columns), strict=True))
+    upper, lower = side(draws[: 2 * columns[0]]), side(draws[2 * columns[0] : -1])
     corners = jnp.concatenate([lower * jnp.asarray([[1, -1]], dtype), upper[::-1]])
-    path = jnp.stack([jnp.stack([jnp.asarray(x, dtype), jnp.zeros((), dtype)]) for x in (0.4, length - 0.4)])
+    ends = jnp.stack([jnp.asarray(x, dtype) for x in (0.4, length - 0.4)])
+    path = jnp.stack([ends, jnp.zeros_like(ends)], -1)
     world = dataclasses.replace(polygon(corners, Kind.ROOM), path=path)
-    turn = jax.random.uniform(of_angle, (), dtype, -jnp.pi, jnp.pi) if angle is None else jnp.asarray(angle, dtype)
-    return moved(world, jnp.stack([jnp.zeros((), dtype), jnp.zeros((), dtype), turn]))
+    turn = 2 * jnp.pi * draws[-1] if angle is None else jnp.asarray(angle, dtype)
+    return moved(world, jnp.zeros(3, dtype).at[2].set(turn))
 
 
 def corridor(key: Array, *, rooms: int = 3, dtype: Any = None) -> World:
@@ -116,35 +112,35 @@ def corridor(key: Array, *, rooms: int = 3, dtype: Any = None) -> World:
       dtype: of the world; jax's default unless given.
     """
     dtype = _float(dtype)
-    of_width, *of_sides = jax.random.split(key, 3)
     length = 4.5 * rooms
-    half = jax.random.uniform(of_width, (), dtype, 0.9, 1.4)
+    draws = jax.random.uniform(key, (8 * rooms + 1,), dtype)
+    half = 0.9 + 0.5 * draws[-1]
 
-    def side(key: Array) -> tuple[Float[Array, "K 2"], Float[Array, "V 2"]]:
+    def side(draws: Float[Array, "4 R"]) -> tuple[Float[Array, "K 2"], Float[Array, "V 2"]]:
         """Outline and way points of the rooms of one side, in the sense of the axis, as seen with that side up."""
-        of_share, of_depth, of_opening, of_place = jax.random.split(key, 4)
-        share = jax.random.uniform(of_share, (rooms,), dtype, 0.7, 1.3)
+        share = 0.7 + 0.6 * draws[0]
         share = share / jnp.sum(share) * (length - (rooms - 1) * _WALL)
         left = jnp.cumsum(share + _WALL) - share - _WALL
         right = left + share
-        depth = jax.random.uniform(of_depth, (rooms,), dtype, 3.0, 5.0)
-        opening = jax.random.uniform(of_opening, (rooms,), dtype, 0.9, 1.2)
-        door = left + 0.2 + opening / 2 + jax.random.uniform(of_place, (rooms,), dtype) * (share - opening - 0.4)
-        near, inner, far = half * jnp.ones_like(door), half + _WALL + 0 * door, half + _WALL + depth
+        depth = 3.0 + 2.0 * draws[1]
+        opening = 0.9 + 0.3 * draws[2]
+        door = left + 0.2 + opening / 2 + draws[3] * (share - opening - 0.4)
+        axis, near, inner = (jnp.full_like(door, y) for y in (0.0, half, half + _WALL))
+        far = inner + depth
         first, second = door - opening / 2, door + opening / 2
         outline = [(first, near), (first, inner), (left, inner), (left, far)]
         outline += [(right, far), (right, inner), (second, inner), (second, near)]
-        before, entry, back = 0 * door, inner + 0.2 * depth, inner + 0.65 * depth
+        entry, back = inner + 0.2 * depth, inner + 0.65 * depth
         turn = [(left + 0.3 * share, back), (left + 0.7 * share, back)]
-        path = [(door, before), (door, entry), *turn, (door, entry), (door, before)]
+        path = [(door, axis), (door, entry), *turn, (door, entry), (door, axis)]
         in_order = [jnp.stack([jnp.stack(p, -1) for p in points], 1).reshape(-1, 2) for points in (outline, path)]
         return in_order[0], in_order[1]
 
-    (upper, up), (lower, down) = (side(k) for k in of_sides)
+    (upper, up), (lower, down) = (side(of_side) for of_side in draws[:-1].reshape(2, 4, rooms))
     mirror = jnp.asarray([[1, -1]], dtype)
-    ends = jnp.stack([jnp.stack([length + 0 * half, -half]), jnp.stack([length + 0 * half, half])])
-    starts = jnp.stack([jnp.stack([0 * half, half]), jnp.stack([0 * half, -half])])
-    corners = jnp.concatenate([lower * mirror, ends, upper[::-1], starts])
+    aside = jnp.stack([jnp.zeros_like(half), half])[None] * jnp.asarray([[1, -1], [1, 1]], dtype)
+    end = aside + jnp.asarray([[length, 0.0]], dtype)
+    corners = jnp.concatenate([lower * mirror, end, upper[::-1], aside[::-1]])
     gates = jnp.asarray([[0.5, 0.0], [length - 0.5, 0.0], [0.5, 0.0]], dtype)
     path = jnp.concatenate([gates[:1], up, gates[1:2], down[::-1] * mirror, gates[2:]])
     return dataclasses.replace(polygon(corners, Kind.ROOM), path=path)
@@ -162,14 +158,14 @@ def changing_room(key: Array, *, scans: int, dtype: Any = None) -> World:
       dtype: of the world; jax's default unless given.
     """
     dtype = _float(dtype)
-    of_order, of_place, of_size, of_angle, of_time = jax.random.split(key, 5)
+    of_order, of_rest = jax.random.split(key)
     cells = jnp.asarray([[x, y] for y in (-2.1, 2.1) for x in (-2.7, 0.0, 2.7)], dtype)
-    order = jax.random.permutation(of_order, 6)
-    shift = jax.random.uniform(of_place, (6, 2), dtype, -1.0, 1.0) * jnp.asarray([[0.35, 0.2]], dtype)
-    center = cells[order] + shift
-    size = jax.random.uniform(of_size, (4, 2), dtype, 0.4, 0.9)
-    angle = jax.random.uniform(of_angle, (5,), dtype, -jnp.pi, jnp.pi)
-    when = jax.random.randint(of_time, (3,), scans // 4, max(scans * 3 // 4, scans // 4 + 1))
+    draws = jax.random.uniform(of_rest, (28,), dtype)
+    shift, size, angle, when = jnp.split(draws, np.cumsum([12, 8, 5]))
+    center = jax.random.permutation(of_order, cells) + (2 * shift.reshape(6, 2) - 1) * jnp.asarray([[0.35, 0.2]], dtype)
+    size = 0.4 + 0.5 * size.reshape(4, 2)
+    angle = 2 * jnp.pi * angle
+    when = (scans * (0.25 + 0.5 * when)).astype(jnp.int32)
 
     def put(cell: int, which: int, **times: Any) -> World:
         return box(center[cell], size[which, 0], size[which, 1], angle[cell], **times)

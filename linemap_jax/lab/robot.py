@@ -148,6 +148,7 @@ def read_odometry(key: Array, poses: Float[Array, "T 3"], odometry: Odometry) ->
     Returns:
       The counted increments, as of `increments`. Shape `[T - 1, 3]`.
     """
+    odometry = jax.tree.map(lambda x: jnp.asarray(x, poses.dtype), odometry)
     x, y, turn = jnp.moveaxis(increments(poses), -1, 0)
     distance, direction = jnp.hypot(x, y), jnp.arctan2(y, x)
     noise = jax.random.normal(key, (2, *turn.shape), poses.dtype)

@@ -89,9 +89,11 @@ def simulate_scan(
     placed = jax.tree.map(lambda x: jnp.asarray(x, dtype), mount or Mount())
     origin = pose[:2] + rotate(pose[2], jnp.stack([placed.x, placed.y]))
     heading = pose[2] + placed.theta
-    of_bearing, of_range, of_dropout, of_mixing = jax.random.split(key, 4)
+    of_noise, of_chance = jax.random.split(key)
+    noise = jax.random.normal(of_noise, (2, count), dtype)
+    chance = jax.random.uniform(of_chance, (2, count), dtype)
 
-    bearings = scanner.bearings + scanner.bearing_sigma * jax.random.normal(of_bearing, (count,), dtype)
+    bearings = scanner.bearings + scanner.bearing_sigma * noise[0]
     hits = cast(world, origin, unit(heading + bearings), scan_index=scan_index)
     ranges, thing, mixed = hits.ranges, hits.thing, jnp.zeros(count, bool)
     if scanner.beam_width is not None:
@@ -103,15 +105,15 @@ def simulate_scan(
         # Where one side meets nothing, nothing comes back from it, and the reading is that of the other.
         far = jnp.where(jnp.isfinite(far), far, near)
         mixed = (sides[0].thing != sides[1].thing) & (near < far)
-        between = near + jax.random.uniform(of_mixing, (count,), dtype) * jnp.where(mixed, far - near, 0)
+        between = near + chance[0] * jnp.where(mixed, far - near, 0)
         ranges, thing = jnp.where(mixed, between, ranges), jnp.where(mixed, NOTHING, thing)
 
     seen = jnp.isfinite(ranges)
     sigma = jnp.hypot(scanner.range_sigma, scanner.relative_sigma * jnp.where(seen, ranges, 0))
-    readings = ranges + sigma * jax.random.normal(of_range, (count,), dtype)
+    readings = ranges + sigma * noise[1]
     step = jnp.where(scanner.step > 0, scanner.step, 1)
     readings = jnp.where((scanner.step > 0) & seen, step * jnp.round(readings / step), readings)
-    lost = jax.random.bernoulli(of_dropout, scanner.dropout, (count,))
+    lost = chance[1] < scanner.dropout
     scan = Scan.from_ranges(
         jnp.where(lost, jnp.inf, readings),
         scanner.bearings,

@@ -175,6 +175,15 @@ def test_float32_stays_and_is_as_good_as_it_can_be() -> None:
     assert np.quantile(error, 0.98) < 1e-4
 
 
+def test_a_world_far_away_is_seen_as_well_in_float32_if_it_is_given_in_float64() -> None:
+    far = jnp.array([3e6, -2e6, 0.0])
+    beams = directions().astype(jnp.float32)
+    there, here = CAST(moved(scattered(2), far), far[:2], beams), CAST(scattered(2), jnp.zeros(2), beams)
+    assert there.ranges.dtype == jnp.float32
+    np.testing.assert_array_equal(there.thing, here.thing)
+    np.testing.assert_allclose(there.ranges, here.ranges, rtol=1e-4)
+
+
 def test_the_gradient_is_finite_and_right() -> None:
     world = scattered(0)
 
