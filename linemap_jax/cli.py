@@ -27,7 +27,8 @@ class LogOptions:
     preset: Literal["default", "paper"] = "default"
     """The method: `paper` is the literal reading of 1996, `default` the same with its known faults mended."""
     config: Path | None = None
-    """TOML file with tables [thresholds], [noise], [rules]; goes over the preset. Options given here go over both."""
+    """TOML file with tables [thresholds], [noise], [rules], [persistence]; goes over the preset. Options given here go
+    over both."""
     range_sigma: Annotated[float | None, tyro.conf.arg(metavar="M")] = None
     """Standard deviation of a range, m. 0.02 unless given."""
     bearing_sigma: Annotated[float | None, tyro.conf.arg(metavar="RAD")] = None
@@ -66,6 +67,9 @@ class Build(LogOptions):
     """CARMEN log, plain or .gz."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="DIR")]
     """Folder for the map; made if it is not there."""
+    pose_error: Literal["independent", "persistent", "unknown"] = "unknown"
+    """How the errors of the poses hang together from scan to scan; `persistent` by [persistence] of the settings file.
+    With `unknown` covariances are bounds that hold in any case."""
     json: bool = False
     """Print the summary as JSON."""
 
@@ -164,7 +168,7 @@ def _of_demo(demo: Demo) -> Build:
 
 
 def _build(command: Build) -> int:
-    options = _options(command)
+    options = _options(command) | {"pose_error": command.pose_error}
     from linemap_jax.core.settings import Mount
     from linemap_jax.core.state import Status
     from linemap_jax.io.map_file import write_map
@@ -187,7 +191,7 @@ def _build(command: Build) -> int:
         "log": command.log.name,
         "preset": command.preset,
         "pose_sigma": command.pose_sigma,
-        **{name: options[name] for name in ("thresholds", "noise", "mount", "rules", "covariance", "jacobians")},
+        **{name: option for name, option in options.items() if name != "segmentation"},
     }
     _make_folder(command.output)
     write_map(map_file, line_map, settings, overwrite=command.overwrite)
@@ -289,7 +293,7 @@ def _extract(command: Extract) -> int:
     from linemap_jax.io.atomic import atomic_write
     from linemap_jax.io.jsonl import lines_of_extraction
 
-    del options["mount"]  # the result stands in the frame of the sensor
+    del options["mount"], options["persistence"]  # the result stands in the frame of the sensor
     log = _open(command)
     capacity, written = SCAN_CAPACITY, 0
     with atomic_write(command.output, overwrite=command.overwrite) as path, path.open("w", encoding="utf-8") as file:
@@ -325,10 +329,10 @@ def _options(command: LogOptions) -> dict[str, Any]:
 
     jax.config.update("jax_enable_x64", command.dtype == "float64")
     _keep_compilations()
-    from linemap_jax.core.settings import Mount, SensorNoise, preset
+    from linemap_jax.core.settings import Mount, Persistence, SensorNoise, preset
     from linemap_jax.io.config import read_config
 
-    options = preset(command.preset) | {"noise": SensorNoise(), "mount": Mount()}
+    options = preset(command.preset) | {"noise": SensorNoise(), "mount": Mount(), "persistence": Persistence()}
     for section, fields in (read_config(command.config) if command.config else {}).items():
         options[section] = dataclasses.replace(options[section], **fields)
     sigmas = {"range_sigma": command.range_sigma, "bearing_sigma": command.bearing_sigma}

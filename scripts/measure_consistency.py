@@ -131,9 +131,9 @@ def fused_scans(runs: int) -> str:
     after = " | ".join(f"{k} scan{'s' if k > 1 else ''}" for k in AFTER)
     return "\n".join(
         [
-            f"{len(cells)} cells with a pose error, e[k+1] = a e[k] + sqrt(1 - a^2) w, {runs} runs each; "
-            f"noise {FUSED_NOISE.strip('; ')}. Mean NEES of a line of the map after so many scans, least to largest "
-            f"cell; the band is [{band.mean[0]:.3f}, {band.mean[1]:.3f}], [{band.inside[0]:.3f}, {band.inside[1]:.3f}].",
+            f"{len(cells)} cells with a pose error, e[k+1] = a e[k] + sqrt(1 - a^2) w, {runs} runs each; noise "
+            f"{FUSED_NOISE.strip('; ')}. Mean NEES of a line of the map after so many scans, least to largest cell; "
+            f"the band is [{band.mean[0]:.3f}, {band.mean[1]:.3f}], [{band.inside[0]:.3f}, {band.inside[1]:.3f}].",
             "",
             f"| a | `pose_error` | {after} | inside 95 % | mean NIS | in band |",
             "| ---: | --- | --- | --- | --- | --- | --- | --- | ---: |",

@@ -8,9 +8,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from linemap_jax.core.settings import Rules, SensorNoise, Thresholds
+from linemap_jax.core.settings import Persistence, Rules, SensorNoise, Thresholds
 
-SECTIONS: dict[str, type] = {"thresholds": Thresholds, "noise": SensorNoise, "rules": Rules}
+SECTIONS: dict[str, type] = {"thresholds": Thresholds, "noise": SensorNoise, "rules": Rules, "persistence": Persistence}
 """The tables of a settings file, and what their keys are the fields of."""
 
 POSITIVE = {"range_sigma"}
@@ -22,7 +22,7 @@ class ConfigError(Exception):
 
 
 def read_config(path: str | os.PathLike[str]) -> dict[str, dict[str, Any]]:
-    """Read a settings file: tables `[thresholds]`, `[noise]` and `[rules]`, each with some of their fields.
+    """Read a settings file: tables `[thresholds]`, `[noise]`, `[rules]`, `[persistence]`, each with some fields.
 
     Args:
       path: of the TOML file.
@@ -56,6 +56,8 @@ def read_config(path: str | os.PathLike[str]) -> dict[str, dict[str, Any]]:
             if not is_switch and not (0 <= value < float("inf") and (value > 0 or key not in POSITIVE)):
                 kind = "positive" if key in POSITIVE else "zero or positive"
                 raise ConfigError(f"{os.fspath(path)}: {key} in [{section}] must be {kind}, not {value}")
+            if section == "persistence" and value > 1:
+                raise ConfigError(f"{os.fspath(path)}: {key} in [{section}] must be at most 1, not {value}")
     return tables
 
 
