@@ -3,7 +3,8 @@
 A line is given twice: as the paper's view, `rho`, `theta`, `cov` of both, `begin`, `end`; and as its state, `anchor`,
 `offset`, `angle`, `cov_independent`, `sqrt_persistent`, `extent`, `var_extent` (the fields of `Lines`), which alone is
 read back; `cov_local` is the covariance of offset and angle. A circle has a `cov`, of (x, y, radius), and its two
-parts, only if it was fitted. Metres, radians, counter-clockwise. Each line and each circle stands on one line of the file.
+parts, only if it was fitted. Metres, radians, counter-clockwise. Each line and each circle stands on one line of the
+file.
 """
 
 import dataclasses
