@@ -1,13 +1,18 @@
 """The criteria of s4.3.1 on scans made by hand: each breaks where it should, and is counted."""
 
 import dataclasses
+import re
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from linemap_jax import Capacity, Extraction, Rules, Thresholds, extract, preset
+from linemap_jax.core.extract import as_dtype, with_defaults
+from linemap_jax.core.segmentation import incremental
+from linemap_jax.core.sensor import points_from_scan
 from linemap_jax.core.state import Pose, Scan
 
 CAPACITY = Capacity(8, 8)
@@ -174,3 +179,34 @@ def test_the_readings_differ_where_they_should() -> None:
     scan = Scan.from_ranges(ranges, BEARINGS)
     both = {name: extract(scan, HERE, capacity=CAPACITY, **preset(name)) for name in ("default", "paper")}
     assert (counts(both["default"]), counts(both["paper"])) == ({"gap": 1}, {"distance": 1})
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_the_loop_over_the_points_is_one_kernel(dtype: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The compiler marks a loop that it makes one kernel of: a tenth of the time."""
+    scan = Scan.from_ranges(np.full(361, 4, dtype), np.linspace(-1.5, 1.5, 361).astype(dtype))
+    pose = as_dtype(HERE, scan.ranges.dtype)
+    thresholds, noise, mount = with_defaults(None, None, None, scan.ranges.dtype)
+    points = points_from_scan(scan, pose, mount, jacobians="analytic")
+
+    def loops() -> tuple[int, int]:
+        """How many loops the compiled program has, and how many of them are a kernel."""
+        compiled = jax.jit(lambda *x: incremental.segment(*x, Rules())).lower(points, thresholds, noise).compile()
+        text = compiled.as_text()
+        return len(re.findall(r" while\(", text)), len(re.findall(r'xla_cpu_small_call="true"', text))
+
+    assert loops() == (1, 1)
+
+    # A body that writes four times as much is one too large.
+    scan_over = jax.lax.scan
+
+    def larger(body: Any, init: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
+        def repeated(carry: jax.Array, row: jax.Array) -> tuple[jax.Array, jax.Array]:
+            carry, out = body(carry, row)
+            return carry, jnp.concatenate([out] * 4)
+
+        carry, out = scan_over(repeated, init, rows)
+        return carry, out[:, : init.shape[0]]
+
+    monkeypatch.setattr(jax.lax, "scan", larger)
+    assert loops() == (1, 0)
