@@ -175,7 +175,10 @@ def measured() -> dict[str, Any]:
     runs = runs_at(40, *SPANS)
     results = {
         (covariance, jacobians): jax.tree.map(
-            np.asarray, measure_lines(points, POSE, runs, NOISE, covariance=covariance, jacobians=jacobians)
+            np.asarray,
+            measure_lines(
+                points, POSE, runs, NOISE, maximum_likelihood=False, covariance=covariance, jacobians=jacobians
+            ),
         )
         for covariance in ("exact", "printed")
         for jacobians in ("autodiff", "analytic")
