@@ -1,0 +1,69 @@
+"""The notebooks run, and what stands in them is the outcome of a full run from top to bottom."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+LARGEST = 700_000
+"""Bytes of a notebook with its pictures: whoever clones the project pays for them."""
+COMPILE_SOONER = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+"""In half of the time; a quick run hardly does anything else."""
+
+pytestmark = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+
+
+def run_notebooks(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    """The script that runs notebooks, in quick mode; in a process of its own, which warnings may not end."""
+    more = {
+        "LINEMAP_QUICK": "1",
+        "PYTHONPATH": os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")])),
+        "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {COMPILE_SOONER}",
+    }
+    return subprocess.run(
+        [sys.executable, ROOT / "scripts/run_notebooks.py", *arguments],
+        env=os.environ | more,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def code_cells(path: Path) -> list[dict]:
+    """Those that hold code; there is at least one."""
+    cells = [cell for cell in json.loads(path.read_text(encoding="utf-8"))["cells"] if cell["cell_type"] == "code"]
+    assert cells
+    return cells
+
+
+def kinds_of_output(cell: dict) -> set[str]:
+    """Such as "display_data"; that of a stream is its name."""
+    return {output.get("name", output["output_type"]) for output in cell["outputs"]}
+
+
+def test_it_runs(path, tmp_path):
+    before = path.read_bytes()
+    done = run_notebooks("-o", tmp_path, path)
+    assert done.returncode == 0, done.stderr
+    assert path.read_bytes() == before
+    quick, kept = code_cells(tmp_path / path.name), code_cells(path)
+    assert [cell["source"] for cell in quick] == [cell["source"] for cell in kept]
+    for cell, other in zip(quick, kept, strict=True):
+        # A first run of matplotlib tells on stderr that it makes its cache of fonts.
+        assert kinds_of_output(cell) - {"stderr"} == kinds_of_output(other)
+
+
+def test_its_outputs_are_kept(path):
+    cells = code_cells(path)
+    assert [cell["execution_count"] for cell in cells] == list(range(1, len(cells) + 1))
+    for cell in cells:
+        kinds = kinds_of_output(cell)
+        assert kinds, cell["source"]
+        assert not kinds & {"error", "stderr"}, cell["outputs"]
+    assert "(quick)" not in json.dumps([cell["outputs"] for cell in cells])
+    assert path.stat().st_size < LARGEST
