@@ -96,11 +96,15 @@ def test_criterion_2_without_giving_back() -> None:
 
 def test_a_point_given_back_keeps_bad_points_out_of_the_fit() -> None:
     wide = Thresholds(line_distance=0.25, line_sigmas=0.0)
-    fits = [extracted(corner(30), wide, give_back_point=rule) for rule in (True, False)]
+    fits = [extracted(corner(30), wide, give_back_point=rule, leave_out_corners=False) for rule in (True, False)]
     errors = [np.abs(np.asarray(found.lines.angle[0])) for found in fits]
     lengths = [len(beams(found, 0)) for found in fits]
     assert lengths[0] == lengths[1] - 1
     assert errors[0] < errors[1]
+    # Without its corner the fit of the longer run is as good; the run holds the points as before.
+    trimmed = extracted(corner(30), wide, give_back_point=False)
+    assert np.abs(trimmed.lines.angle[0]) < 1e-9 < errors[1]
+    assert len(beams(trimmed, 0)) == lengths[1]
 
 
 @pytest.mark.parametrize("sigmas", [0.0, 5.0])
