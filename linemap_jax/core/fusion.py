@@ -67,7 +67,8 @@ def combine(old: Errors, new: Errors, pose_error: PoseError) -> tuple[Float[Arra
         c_new = c_new + JACOBIAN_ERROR**2 * squared(a_new)
     times = old.times_detected + new.times_detected
     if pose_error == "unknown":
-        w = (old.times_detected / times).astype(c_old.dtype)[..., None, None]
+        # As floats of the right kind: the quotient of two int32 is a float32.
+        w = (old.times_detected.astype(c_old.dtype) / times.astype(c_old.dtype))[..., None, None]
         before = c_old + squared(a_old) / w
         innovation = before + c_new + squared(a_new) / (1 - w)
     else:
@@ -262,11 +263,13 @@ def fuse_circles(model: Circles, new: Circles, matches: CircleMatches, rules: Ru
 
         both = (has_fit & model.fitted)[:, None, None]
         errors_seen = dataclasses.replace(_errors(fit), times_detected=jnp.ones_like(times))
-        gain, joint = combine(_or_neutral(errors, both), _or_neutral(errors_seen, both), pose_error)
+        alike = _at_radius(errors_seen, seen[:, 2], old[:, 2], both)
+        gain, joint = combine(_or_neutral(errors, both), _or_neutral(alike, both), pose_error)
 
         fused = jnp.where(model.fitted[:, None], old, running)
         fused = jnp.where(has_fit[:, None], seen, fused)
         fused = jnp.where(both[..., 0], old + apply(gain, seen - old), fused)
+        joint = _at_radius(joint, old[:, 2], fused[:, 2], both)
         errors = choose(both[:, 0, 0], joint, choose(has_fit, errors_seen, errors))
         fitted = model.fitted | has_fit
 
@@ -280,6 +283,24 @@ def fuse_circles(model: Circles, new: Circles, matches: CircleMatches, rules: Ru
         fitted=jnp.where(touched, fitted, model.fitted),
         times_detected=times + touched.astype(jnp.int32),
     )
+
+
+def _at_radius(
+    errors: Errors, radius: Float[Array, " K"], other: Float[Array, " K"], meant: Bool[Array, "K 1 1"]
+) -> Errors:
+    """The errors of fitted circles that were taken at one radius, at another one, for those that are meant.
+
+    What ranges tell is the curvature: the variance of 1 / R hardly depends on R, and so that of R grows as R^4. Taken
+    as they are, scans in which noise made a pole too small would weigh more than those in which it made it too large,
+    and after fifty scans the pole would be too small by two sigma. The part of the errors of the centre that goes with
+    the radius grows alike.
+    """
+    positive = meant[:, 0, 0] & (radius > 0) & (other > 0)
+    growth = jnp.where(positive, other / jnp.where(positive, radius, 1), 1) ** 4 - 1
+    cov = errors.cov_independent
+    var = jnp.where(positive & (cov[:, 2, 2] > 0), cov[:, 2, 2], 1)
+    with_radius = cov[:, :, 2, None] * cov[:, None, 2, :] / var[:, None, None]
+    return dataclasses.replace(errors, cov_independent=cov + growth[:, None, None] * with_radius)
 
 
 def _errors(primitives: Lines | Circles) -> Errors:
