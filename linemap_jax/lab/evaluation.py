@@ -1,9 +1,10 @@
-"""What a map is worth, without a truth to hold it against."""
+"""What a map is worth, without a truth to hold it against: by itself, and against a log."""
 
 import dataclasses
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Iterator
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,8 +13,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from linemap_jax.core.frames import dot
 from linemap_jax.core.sensor import points_from_scan
-from linemap_jax.core.settings import Jacobians, Mount
-from linemap_jax.core.state import LineMap, Lines, Pose, Scan, SlotsT, pad_stack
+from linemap_jax.core.settings import Jacobians, Mount, Number
+from linemap_jax.core.state import Circles, LineMap, Lines, Pose, Scan, SlotsT, pad_stack
+from linemap_jax.lab.scoring import expected
+from linemap_jax.lab.world import NEVER, Kind, Poles, Segments, World
 
 
 @partial(jax.jit, static_argnames="jacobians")
@@ -73,15 +76,24 @@ def explained_share(
     Returns:
       A number in [0, 1]; 0 where no return counts.
     """
-    line_map = LineMap(lines=_crowded(line_map.lines), circles=_crowded(line_map.circles))
+    line_map = _without_free_slots(line_map)
     hits = total = 0
-    for scans, poses in chunks:
-        active = np.arange(chunk) < scans.ranges.shape[0]
-        scans, poses = pad_stack(scans, chunk), pad_stack(poses, chunk)
-        scans = dataclasses.replace(scans, valid=jnp.asarray(np.asarray(scans.valid) & active[:, None]))
+    for scans, poses in _filled(chunks, chunk):
         h, t = explained(line_map, scans, poses, mount, **options)
         hits, total = hits + int(h), total + int(t)
     return hits / total if total else 0.0
+
+
+def _filled(chunks: Iterable[tuple[Scan, Pose]], size: int) -> Iterator[tuple[Scan, Pose]]:
+    """The chunks, filled up with scans that hold nothing."""
+    for scans, poses in chunks:
+        active = np.arange(size) < scans.ranges.shape[0]
+        scans, poses = pad_stack(scans, size), pad_stack(poses, size)
+        yield dataclasses.replace(scans, valid=jnp.asarray(np.asarray(scans.valid) & active[:, None])), poses
+
+
+def _without_free_slots(line_map: LineMap) -> LineMap:
+    return LineMap(lines=_crowded(line_map.lines), circles=_crowded(line_map.circles))
 
 
 def _crowded(slots: SlotsT) -> SlotsT:
@@ -134,3 +146,93 @@ def duplicates(
 
     index = jnp.arange(lines.valid.shape[0])
     return jnp.any(jax.vmap(jax.vmap(beside, (None, 0)), (0, None))(index, index), -1)
+
+
+@jax.jit
+def beam_residuals(
+    line_map: LineMap, scans: Scan, poses: Pose, mount: Mount | None = None, *, closer_than: Number = 20.0
+) -> tuple[Float[Array, "T N"], Bool[Array, "T N"]]:
+    """Measured range less the range at which the beam meets the map first.
+
+    Args:
+      line_map: the map; its lines are taken as walls, its circles as poles.
+      scans: stacked scans, `[T, N]`.
+      poses: stacked poses of the robot, `[T]`.
+      mount: of the scanner on the robot.
+      closer_than: only returns nearer than this count, m.
+
+    Returns:
+      The residuals, m, and which of them there are: those of returns whose beam meets the map. Both `[T, N]`.
+    """
+    world = world_of_map(line_map)
+
+    def one(scan_pose: tuple[Scan, Pose]) -> tuple[Array, Array]:
+        scan, pose = scan_pose
+        told = expected(world, scan, pose.mean, mount).ranges
+        counts = scan.valid & (scan.ranges < closer_than) & jnp.isfinite(told)
+        return jnp.where(counts, scan.ranges - told, 0), counts
+
+    return jax.lax.map(one, (scans, poses))
+
+
+class LogScore(NamedTuple):
+    """A map against a log, without a truth; NaN where there is nothing to tell of."""
+
+    returns: int  # nearer than 20 m
+    explained: float  # share of them that lie within 10 cm of a line or of the rim of a circle
+    met: float  # share of them whose beam meets the map
+    residual_median: float  # m, of the absolute residuals along those beams
+    residual_90: float  # m, 90 % of them are less
+
+
+def evaluate_log(
+    line_map: LineMap, chunks: Iterable[tuple[Scan, Pose]], mount: Mount | None = None, *, chunk: int
+) -> LogScore:
+    """What a log, which comes piece by piece, says of a map. One absolute residual a return is held in memory.
+
+    Args:
+      line_map: the map.
+      chunks: stacked scans and poses, at most `chunk` of them each time.
+      mount: of the scanner on the robot.
+      chunk: size to which pieces are filled up.
+    """
+    line_map = _without_free_slots(line_map)
+    hits = total = 0
+    residuals = [np.zeros(0)]
+    for scans, poses in _filled(chunks, chunk):
+        h, t = explained(line_map, scans, poses, mount)
+        hits, total = hits + int(h), total + int(t)
+        residual, counts = beam_residuals(line_map, scans, poses, mount)
+        residuals.append(np.abs(np.asarray(residual, float)[np.asarray(counts)]))
+    residual = np.concatenate(residuals)
+    median, most = np.quantile(residual, (0.5, 0.9)).tolist() if residual.size else (math.nan, math.nan)
+    share, met = (hits / total, residual.size / total) if total else (math.nan, math.nan)
+    return LogScore(total, share, met, median, most)
+
+
+def world_of_map(line_map: LineMap) -> World:
+    """The world that a map describes: each line a wall, each circle a pole."""
+    lines, circles = line_map.lines, line_map.circles
+    index = jnp.arange(lines.valid.shape[0], dtype=jnp.int32)
+
+    def all_alike(slots: Lines | Circles, value: int) -> Int[Array, " K"]:
+        return jnp.full(slots.valid.shape, value, jnp.int32)
+
+    return World(
+        segments=Segments(
+            ends=jnp.stack([lines.begin, lines.end], -2),
+            body=index,
+            kind=all_alike(lines, Kind.WALL),
+            appears=all_alike(lines, 0),
+            vanishes=all_alike(lines, NEVER),
+            valid=lines.valid,
+        ),
+        poles=Poles(
+            center=circles.center,
+            radius=circles.radius,
+            appears=all_alike(circles, 0),
+            vanishes=all_alike(circles, NEVER),
+            valid=circles.valid,
+        ),
+        path=jnp.zeros((0, 2), lines.offset.dtype),
+    )
