@@ -95,7 +95,7 @@ def jac_step_points(
     """
     if jacobians == "autodiff":
         _, pull_back = jax.vjp(lambda x: step(x, runs, line, at), position)
-        seeds = jnp.eye(2, dtype=position.dtype)[:, :, None] * jnp.ones_like(line[0])
+        seeds = jnp.eye(2, dtype=position.dtype)[:, :, None] * jnp.ones_like(line[:1])[None]
         offset, angle = (pull_back(seed)[0] for seed in seeds)
         return jnp.stack([offset, angle], 1)
     if jacobians == "analytic":
