@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import json
+import math
 import os
 import shutil
 import sys
@@ -15,9 +16,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 if TYPE_CHECKING:
+    from jax import Array
+
     from linemap_jax.core.state import LineMap, Report
     from linemap_jax.io.log import Log
     from linemap_jax.io.scans import Chunk
+    from linemap_jax.lab.world import World
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -104,11 +108,69 @@ class Verify:
     """Print the table, with every single check, as JSON."""
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Simulate:
+    """Simulate a drive: writes a CARMEN log, scans.log.gz, and the truth, world.geojson and poses.tum."""
+
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="DIR")]
+    """Folder for the log and the truth; made if it is not there."""
+    world: Annotated[Path | None, tyro.conf.arg(metavar="FILE.geojson")] = None
+    """World to drive through, with a path; in place of --kind."""
+    kind: Literal["laboratory", "corridor", "room", "free_room", "rectilinear_room", "changing_room"] = "laboratory"
+    """World to make."""
+    scans: Annotated[int, tyro.conf.arg(metavar="N")] = 300
+    """Number of scans along the path."""
+    scanner: Literal["pls", "lms200", "utm30lx", "rplidar_a1"] = "pls"
+    """The instrument."""
+    pose_sigma: Annotated[tuple[float, float, float], tyro.conf.arg(metavar="X Y THETA")] = (0.01, 0.01, 0.002)
+    """Standard deviations of every pose of the log, m m rad."""
+    pose_correlation: Annotated[float, tyro.conf.arg(metavar="A")] = 0.0
+    """Of the pose errors, from one scan to the next: 0 for independent ones, 1 for one error that stays."""
+    turns: Literal["smooth", "spot"] = "smooth"
+    """How the robot takes the corners of its path: cut by arcs, or turning on the spot."""
+    seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0
+    """Decides everything that is left to chance."""
+    overwrite: bool = False
+    """Replace output that is there already."""
+    quiet: bool = False
+    """No summary."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Evaluate:
+    """Score a map: against a true world, or against a log, or both."""
+
+    map: tyro.conf.Positional[Path]
+    """map.json of `build`."""
+    world: Annotated[Path | None, tyro.conf.arg(metavar="FILE.geojson")] = None
+    """The truth. With a log, only what its beams met can be missed; without, all of it."""
+    log: Annotated[Path | None, tyro.conf.arg(metavar="LOG")] = None
+    """CARMEN log, plain or .gz: how much of it the map explains."""
+    at: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """The truth is what is there at scan N. The last one of the log, or else after all changes, unless given."""
+    distance: Annotated[float, tyro.conf.arg(metavar="M")] = 0.05
+    """How far a line may lie from a wall, and the centre of a circle outside of a pole, m."""
+    range_max: Annotated[float | None, tyro.conf.arg(metavar="M")] = None
+    """Ranges from here on are no-returns, m. What the log states, or 50, unless given."""
+    strict: bool = False
+    """Refuse a log with malformed lines, instead of skipping and counting them."""
+    quiet: bool = False
+    """No progress, no warnings."""
+    json: bool = False
+    """Print the scores as JSON."""
+
+
 DEMO_NOISE = {"range_sigma": 0.015, "bearing_sigma": 0.0005, "pose_sigma": (0.01, 0.01, 0.002)}
 """What the demo log was made with."""
 
 SCANS_EXPLAINED = 500
-"""The share of returns that the map explains is taken over so many scans at most."""
+"""What a log says of a map is taken over so many of its scans at most."""
+
+MOST_SCANS = 20_000
+"""Of a simulated drive, which is held in memory as a whole."""
+
+SCAN_SECONDS = 0.2
+"""Between two simulated scans."""
 
 START_CAPACITY = (512, 256)
 """Slots for lines and circles to begin with. To grow costs a compilation, and most buildings fit into these."""
@@ -135,6 +197,8 @@ def main(args: list[str] | None = None) -> int:
         Annotated[Demo, tyro.conf.subcommand("demo")]
         | Annotated[Build, tyro.conf.subcommand("build")]
         | Annotated[Extract, tyro.conf.subcommand("extract")]
+        | Annotated[Simulate, tyro.conf.subcommand("simulate")]
+        | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
         | Annotated[Verify, tyro.conf.subcommand("verify")],
         prog="linemap",
         description="Maps of line segments and circles from 2D range scans, with covariances that can be believed.",
@@ -146,14 +210,19 @@ def main(args: list[str] | None = None) -> int:
     from linemap_jax.io.config import ConfigError
     from linemap_jax.io.log import LogError
     from linemap_jax.io.map_file import MapFileError
+    from linemap_jax.io.worlds import WorldFileError
 
     try:
         if isinstance(command, Verify):
             return _verify(command)
+        if isinstance(command, Simulate):
+            return _simulate(command)
+        if isinstance(command, Evaluate):
+            return _evaluate(command)
         if isinstance(command, Extract):
             return _extract(command)
         return _build(_of_demo(command) if isinstance(command, Demo) else command)
-    except (LogError, OutputError, MapFileError, ConfigError, UsageError) as error:
+    except (LogError, OutputError, MapFileError, WorldFileError, ConfigError, UsageError) as error:
         print(f"linemap: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
@@ -308,6 +377,265 @@ def _extract(command: Extract) -> int:
     return 0
 
 
+def _simulate(command: Simulate) -> int:
+    _check_simulate(command)
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    _keep_compilations()
+    import jax.numpy as jnp
+    import numpy as np
+
+    from linemap_jax.io.carmen_writer import write_carmen
+    from linemap_jax.io.tum import write_tum
+    from linemap_jax.io.worlds import write_world
+    from linemap_jax.lab.check import WorldError, check
+    from linemap_jax.lab.robot import dead_reckoning
+    from linemap_jax.lab.scanners import PRESETS, noise_of
+    from linemap_jax.lab.simulate import simulate
+    from linemap_jax.lab.world import arrays_from_world
+
+    files = log_file, world_file, poses_file = [
+        command.output / name for name in ("scans.log.gz", "world.geojson", "poses.tum")
+    ]
+    _check_output(command.output, *files, overwrite=command.overwrite)
+    of_world, of_drive = jax.random.split(jax.random.key(command.seed))
+    name, scanner = str(command.world or command.kind), PRESETS[command.scanner]()
+    world = _read_world(command.world) if command.world else _made_world(command, of_world)
+    if not world.path.shape[0]:
+        raise UsageError(f"{name} has no path for the robot")
+    try:
+        check(world)
+        run = jax.jit(simulate, static_argnames=("count", "turns"))
+        log = run(
+            of_drive,
+            world,
+            scanner,
+            count=command.scans,
+            cov_pose=jnp.diag(jnp.square(jnp.asarray(command.pose_sigma))),
+            correlation=command.pose_correlation,
+            turns=command.turns,
+        )
+        check(world, log.true_poses)
+    except WorldError as error:
+        raise UsageError(f"{name}: {error}") from error
+
+    stamps = SCAN_SECONDS * np.arange(command.scans)
+    given = f"{command.scanner}, pose sigma {command.pose_sigma}, correlation {command.pose_correlation}"
+    _make_folder(command.output)
+    write_carmen(
+        log_file,
+        ranges=np.where(log.scans.valid, log.scans.ranges, 0),
+        bearings=scanner.bearings,
+        range_max=float(scanner.range_max),
+        poses=log.poses.mean,
+        odometry=dead_reckoning(log.true_poses[0], log.odometry),
+        timestamps=stamps,
+        comments=[f"simulated by linemap: {ascii(name)}, {given}, seed {command.seed}"],
+        overwrite=command.overwrite,
+    )
+    write_world(world_file, arrays_from_world(world), overwrite=command.overwrite)
+    write_tum(poses_file, stamps, log.true_poses, overwrite=command.overwrite)
+    if not command.quiet:
+        metres = np.hypot(*np.diff(np.asarray(log.true_poses)[:, :2], axis=0).T).sum()
+        noise = noise_of(scanner)
+        sigmas = " ".join(f"{sigma:g}" for sigma in command.pose_sigma)
+        print(
+            f"{command.scans} scans of {len(scanner.bearings)} beams along {metres:.1f} m -> {log_file}\n"
+            f"truth: {world_file}, {poses_file}\n"
+            f"noise: --range-sigma {float(noise.range_sigma):.4g} --bearing-sigma {float(noise.bearing_sigma):g} "
+            f"--pose-sigma {sigmas}"
+        )
+    return 0
+
+
+def _check_simulate(command: Simulate) -> None:
+    """Refuse numbers that make no sense."""
+    if not 1 <= command.scans <= MOST_SCANS:
+        raise UsageError(f"--scans must be from 1 to {MOST_SCANS}, not {command.scans}")
+    if not all(0 <= x < float("inf") for x in command.pose_sigma):
+        raise UsageError(f"--pose-sigma must be zero or positive, not {command.pose_sigma}")
+    if not 0 <= command.pose_correlation <= 1:
+        raise UsageError(f"--pose-correlation must be from 0 to 1, not {command.pose_correlation}")
+    if not 0 <= command.seed < 2**63:
+        raise UsageError(f"--seed must be from 0 to 2^63 - 1, not {command.seed}")
+
+
+def _made_world(command: Simulate, key: "Array") -> "World":
+    """The world of `--kind`."""
+    import jax.numpy as jnp
+
+    from linemap_jax.lab import generators
+
+    if command.kind == "laboratory":
+        return generators.laboratory(key, change=command.scans // 2)
+    if command.kind == "changing_room":
+        return generators.changing_room(key, scans=command.scans)
+    if command.kind == "corridor":
+        return generators.corridor(key)
+    if command.kind == "free_room":
+        return generators.free_room(key, vertices=12)
+    if command.kind == "rectilinear_room":
+        return generators.rectilinear_room(key, vertices=24)
+    around = jnp.asarray([[-2.0, -1.0], [2.0, -1.0], [2.0, 1.0], [-2.0, 1.0], [-2.0, -1.0]])
+    return dataclasses.replace(generators.room(8.0, 6.0), path=around)
+
+
+def _read_world(path: Path) -> "World":
+    from linemap_jax.io.worlds import read_world
+    from linemap_jax.lab.world import world_from_arrays
+
+    return world_from_arrays(read_world(path, dtype="float64"))
+
+
+def _evaluate(command: Evaluate) -> int:
+    if command.world is None and command.log is None:
+        raise UsageError("evaluate needs --world, --log, or both")
+    if not 0 < command.distance < float("inf"):
+        raise UsageError(f"--distance must be positive, not {command.distance}")
+    if command.at is not None and not 0 <= command.at < 2**31 - 1:
+        raise UsageError(f"--at must be from 0 to 2^31 - 2, not {command.at}")
+    if command.range_max is not None and not command.range_max > 0:
+        raise UsageError(f"--range-max must be positive, not {command.range_max}")
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    _keep_compilations()
+    from linemap_jax.io.map_file import read_map
+
+    line_map, _ = read_map(command.map, dtype="float64")
+    scores: dict[str, Any] = {"map": str(command.map)}
+    if command.world is not None:
+        scores["truth"] = _against_world(command, command.world, line_map)
+    if command.log is not None:
+        scores["log"] = _against_log(command, command.log, line_map)
+    print(json.dumps(scores, indent=2, allow_nan=False) if command.json else _scores_in_words(scores))
+    return 0
+
+
+def _against_world(command: Evaluate, path: Path, line_map: "LineMap") -> dict[str, Any]:
+    """The score of a map against the truth, in numbers; None where there is nothing to tell of."""
+    import numpy as np
+
+    from linemap_jax.build import CHUNK
+    from linemap_jax.lab.check import WorldError, check
+    from linemap_jax.lab.evaluation import seen_in_log
+    from linemap_jax.lab.scoring import GONE, Gates, evaluate, times_of_objects
+    from linemap_jax.lab.world import NEVER
+
+    world = _read_world(path)
+    try:
+        check(world, world.path[:0])  # where the robot was is no matter
+    except WorldError as error:
+        raise UsageError(f"{path}: {error}") from error
+    seen, at = None, NEVER - 1
+    if command.log is not None:
+        log = _open_evaluated(command, command.log)
+        with _progress(command, log):
+            seen, scans = seen_in_log(world, _plain_chunks(log), chunk=CHUNK)
+        at = scans - 1
+    at = at if command.at is None else command.at
+    score = evaluate(line_map, world, seen, scan_index=at, gates=Gates(distance=command.distance))
+    _, vanishes, exists = (np.asarray(x) for x in times_of_objects(world))
+    gone = exists & (vanishes <= at)
+    offset, angle = (_or_none(x) for x in np.asarray(score.error))
+    return {
+        "world": str(path),
+        "at": None if at == NEVER - 1 else at,
+        "distance_m": command.distance,
+        "precision": _or_none(score.precision),
+        "recall": _or_none(score.recall),
+        "line_length_m": float(score.line_length),
+        "seen_length_m": float(score.wall_seen.sum()),
+        "lines": int(line_map.lines.valid.sum()),
+        "phantom_lines": int(score.phantom_line.sum()),
+        "walls": int((score.wall_seen > 0).sum()),
+        "walls_held_twice": int(score.duplicates),
+        "fragments": int(score.fragments),
+        "offset_rms_m": offset,
+        "angle_rms_rad": angle,
+        "mean_nees": _or_none(score.nees),
+        "circles": int(line_map.circles.valid.sum()),
+        "phantom_circles": int(score.phantom_circle.sum()),
+        "poles": int(((score.circles_of_pole > 0) | score.missed_pole).sum()),
+        "missed_poles": int(score.missed_pole.sum()),
+        "poles_held_twice": int((score.circles_of_pole > 1).sum()),
+        "gone": int(gone.sum()),
+        "gone_but_held": int((gone & (np.asarray(score.object_held) >= GONE)).sum()),
+    }
+
+
+def _against_log(command: Evaluate, path: Path, line_map: "LineMap") -> dict[str, Any]:
+    """What a log says of a map, in numbers; None where there is nothing to tell of."""
+    from linemap_jax.build import CHUNK
+    from linemap_jax.lab.evaluation import evaluate_log
+
+    log = _open_evaluated(command, path)
+    scans = sum(1 for _ in log)
+    _warn(command, log)
+    with _progress(command, log):
+        score = evaluate_log(line_map, _plain_chunks(log, every=-(-scans // SCANS_EXPLAINED)), chunk=CHUNK)
+    return {
+        "log": str(path),
+        "scans": scans,
+        "returns": score.returns,
+        "explained": _or_none(score.explained),
+        "met": _or_none(score.met),
+        "residual_median_m": _or_none(score.residual_median),
+        "residual_90_m": _or_none(score.residual_90),
+    }
+
+
+def _open_evaluated(command: Evaluate, path: Path) -> "Log":
+    from linemap_jax.io.log import open_log
+
+    return open_log(path, strict=command.strict, range_max=command.range_max)
+
+
+def _plain_chunks(log: "Log", every: int = 1) -> Iterator[Any]:
+    """Scans and poses of a log as they are."""
+    import numpy as np
+
+    from linemap_jax.build import CHUNK
+    from linemap_jax.io.scans import chunks_of_readings
+
+    for chunk in chunks_of_readings(log, CHUNK, cov_pose=np.zeros((3, 3)), every=every, dtype="float64"):
+        yield chunk.scans, chunk.poses
+
+
+def _or_none(number: Any) -> float | None:
+    return float(number) if math.isfinite(number) else None
+
+
+def _scores_in_words(scores: dict[str, Any]) -> str:
+    def told(value: float | None, form: str, scale: float = 1.0) -> str:
+        return "-" if value is None else format(scale * value, form)
+
+    said = []
+    if (score := scores.get("truth")) is not None:
+        near = f"{100 * score['distance_m']:g} cm"
+        offset, angle = told(score["offset_rms_m"], ".1f", 100), told(score["angle_rms_rad"], ".2f", 180 / math.pi)
+        said += [
+            f"precision {told(score['precision'], '.1%')} of {score['line_length_m']:.1f} m of lines, within {near}; "
+            f"{score['phantom_lines']} of {score['lines']} lines are phantoms",
+            f"recall {told(score['recall'], '.1%')} of {score['seen_length_m']:.1f} m of walls that could be seen; "
+            f"{score['walls_held_twice']} of {score['walls']} walls are held twice, "
+            f"{score['fragments']} pieces are too many",
+            f"error {offset} cm, {angle} degrees (rms); mean NEES {told(score['mean_nees'], '.2f')} "
+            "(2 if the covariances are right)",
+            f"{score['missed_poles']} of {score['poles']} poles are missed, {score['poles_held_twice']} held twice; "
+            f"{score['phantom_circles']} of {score['circles']} circles are phantoms",
+            f"{score['gone_but_held']} of {score['gone']} things that are gone are still held",
+        ]
+    if (score := scores.get("log")) is not None:
+        median, most = (told(score[f"residual_{name}_m"], ".1f", 100) for name in ("median", "90"))
+        said += [
+            f"{told(score['explained'], '.1%')} of the returns under 20 m lie within 10 cm of the map; "
+            f"along the beam they are off by {median} cm (median), {most} cm (90 %)"
+        ]
+    return "\n".join(said)
+
+
 def _verify(command: Verify) -> int:
     _keep_compilations()
     from linemap_jax.lab.verification import as_dict, as_text, verify
@@ -422,7 +750,7 @@ def _cache_folder() -> Path:
 
 
 @contextlib.contextmanager
-def _progress(command: LogOptions | Build, log: "Log") -> Iterator[None]:
+def _progress(command: LogOptions | Evaluate, log: "Log") -> Iterator[None]:
     """A progress bar over the bytes of the log, where somebody watches."""
     if command.quiet or not sys.stderr.isatty():
         yield
@@ -440,12 +768,12 @@ def _progress(command: LogOptions | Build, log: "Log") -> Iterator[None]:
         log.progress = None
 
 
-def _warn(command: LogOptions, log: "Log") -> None:
+def _warn(command: LogOptions | Evaluate, log: "Log") -> None:
     for warning in log.notes.warnings():
         _say(command, f"warning: {log.path}: {warning}")
 
 
-def _say(command: LogOptions, sentence: str) -> None:
+def _say(command: LogOptions | Evaluate, sentence: str) -> None:
     if not command.quiet:
         print(f"linemap: {sentence}", file=sys.stderr)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from linemap_jax import Rules
-from linemap_jax.cli import Build, Demo, Extract
+from linemap_jax.cli import Build, Demo, Evaluate, Extract, Simulate
 
 README = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
 
@@ -39,17 +39,32 @@ def test_the_python_runs_as_a_user_would_run_it(tmp_path):
     assert (tmp_path / "map.json").stat().st_size > 10_000
 
 
-def test_the_table_of_options_is_complete():
-    told = {re.findall(r"--([a-z-]+)", option)[0].replace("-", "_") for option in table_below("From a log to a map")}
-    fields = {field.name for kind in (Build, Extract, Demo) for field in dataclasses.fields(kind)}
-    assert told == fields - {"log"}
+TABLES = {
+    "From a log to a map": (Build, Extract, Demo),
+    "Simulated drives, and how good a map is": (Simulate, Evaluate),
+}
 
 
-@pytest.mark.parametrize("option", ["pose_sigma", "range_min", "every", "preset", "jacobians", "dtype"])
-def test_the_defaults_of_the_options_are_those_of_the_command(option):
-    rows = table_below("From a log to a map").items()
+@pytest.mark.parametrize("heading", TABLES)
+def test_the_tables_of_options_are_complete(heading):
+    told = {re.findall(r"--([a-z-]+)", option)[0].replace("-", "_") for option in table_below(heading)}
+    fields = {field.name for kind in TABLES[heading] for field in dataclasses.fields(kind)}
+    assert told == fields - ({"log"} if Build in TABLES[heading] else {"map"})
+
+
+@pytest.mark.parametrize(
+    ("heading", "option"),
+    [
+        *(("From a log to a map", x) for x in ("pose_sigma", "range_min", "every", "preset", "jacobians", "dtype")),
+        *(("Simulated drives, and how good a map is", x) for x in ("kind", "scans", "scanner", "pose_sigma")),
+        *(("Simulated drives, and how good a map is", x) for x in ("pose_correlation", "turns", "seed", "distance")),
+    ],
+)
+def test_the_defaults_of_the_options_are_those_of_the_command(heading, option):
+    rows = table_below(heading).items()
     told = next(cells[0] for name, cells in rows if f"--{option.replace('_', '-')} " in name)
-    default = next(field.default for field in dataclasses.fields(Build) if field.name == option)
+    fields = {field.name: field.default for kind in reversed(TABLES[heading]) for field in dataclasses.fields(kind)}
+    default = fields[option]
     words = default if isinstance(default, tuple) else (default,)
     assert told.strip("`") == " ".join(f"{word:g}" if isinstance(word, float) else str(word) for word in words)
 

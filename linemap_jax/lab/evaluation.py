@@ -15,7 +15,7 @@ from linemap_jax.core.frames import dot
 from linemap_jax.core.sensor import points_from_scan
 from linemap_jax.core.settings import Jacobians, Mount, Number
 from linemap_jax.core.state import Circles, LineMap, Lines, Pose, Scan, SlotsT, pad_stack
-from linemap_jax.lab.scoring import expected
+from linemap_jax.lab.scoring import Seen, expected, seen_nothing, survey
 from linemap_jax.lab.world import NEVER, Kind, Poles, Segments, World
 
 
@@ -208,6 +208,25 @@ def evaluate_log(
     median, most = np.quantile(residual, (0.5, 0.9)).tolist() if residual.size else (math.nan, math.nan)
     share, met = (hits / total, residual.size / total) if total else (math.nan, math.nan)
     return LogScore(total, share, met, median, most)
+
+
+def seen_in_log(world: World, chunks: Iterable[tuple[Scan, Pose]], *, chunk: int) -> tuple[Seen, int]:
+    """What the beams of a log, which comes piece by piece, have seen of a world; as `scoring.survey`.
+
+    Args:
+      world: the truth.
+      chunks: stacked scans and poses, at most `chunk` of them each time.
+      chunk: size to which pieces are filled up.
+
+    Returns:
+      What has been seen, and the number of scans.
+    """
+    seen, count = seen_nothing(world), 0
+    for scans, poses in chunks:
+        [(padded, places)] = _filled([(scans, poses)], chunk)
+        seen = survey(seen, world, padded, places.mean, first=jnp.asarray(count, jnp.int32))
+        count += scans.ranges.shape[0]
+    return seen, count
 
 
 def world_of_map(line_map: LineMap) -> World:

@@ -23,6 +23,10 @@ CELLS = 128
 """Cells of a straight piece, unless told otherwise: 10 cm each up to 12.8 m."""
 MIN_RETURNS = 3
 """A scan has seen a pole if so many beams came back from it: fewer points make no circle."""
+GONE = 0.1
+"""An object of which the map holds less than this is gone from it."""
+THERE = 0.5
+"""An object of which the map holds this much is in it."""
 
 
 @pytree
@@ -359,8 +363,8 @@ def scans_until(
 ) -> tuple[Int[Array, " O"], Bool[Array, " O"]]:
     """How many scans it took, for each object: until a vanished one is gone, or until a new one is there.
 
-    A vanished one: `done = held(...) < 0.1`, `since` its `vanishes`, and those scans count in which beams passed
-    through its place. A new one: `done = held(...) >= 0.5`, `since` its `appears`, and those count that had returns
+    A vanished one: `done = held(...) < GONE`, `since` its `vanishes`, and those scans count in which beams passed
+    through its place. A new one: `done = held(...) >= THERE`, `since` its `appears`, and those count that had returns
     from it. Both counts of beams are those of `beams_on_objects`.
 
     Args:
