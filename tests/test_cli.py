@@ -219,7 +219,7 @@ def test_config_goes_over_the_preset_and_options_over_both(run, log, tmp_path):
 def test_the_paper_preset_in_float64_with_two_rules_switched(run, log, tmp_path):
     config = tmp_path / "settings.toml"
     config.write_text("[rules]\nfit_circles = true\nweigh_circles = true\n")
-    args = "--preset", "paper", "--dtype", "float64", "--config", config
+    args = "--preset", "paper", "--dtype", "float64", "--config", config, "--range-sigma", 0.01
     status, _, err = run("build", log, "-o", tmp_path / "out", *args)
 
     assert (status, err) == (0, "")
