@@ -130,7 +130,9 @@ def extract_points(
     cluster_ends, cluster = circles_.cluster(points, points.valid & (runs.of_point < 0), thresholds)
     lone = cluster.n < 2
     clusters, circles_full = select_runs(cluster.n, cluster_ends & ~lone, capacity.circles)
-    circles = circles_.measure_circles(points, pose, clusters, cluster, thresholds, noise, fit=rules.fit_circles)
+    circles = circles_.measure_circles(
+        points, pose, clusters, thresholds, noise, fit=rules.fit_circles, jacobians=jacobians
+    )
     near = circles_.near_lines(circles, lines, thresholds)
     circles = dataclasses.replace(circles, valid=circles.valid & ~near)
 

@@ -360,7 +360,10 @@ def _update_circles(
 
     fresh = new.valid & (match.slot < 0) & ~match.ambiguous & ~near_lines(new, lines, thresholds)
     slot, overflow = free_slots(fresh, model.valid)
-    model = put(model, slot, new)
+    # A circle that is not fitted is the visible arc and moves with the viewpoint: its covariance is this scan's alone.
+    names = ("cov_independent", "sqrt_persistent")
+    lasting = {name: jnp.where(new.fitted[:, None, None], getattr(new, name), 0) for name in names}
+    model = put(model, slot, dataclasses.replace(new, **lasting))
 
     # Only lines that this scan touched can have come near a circle.
     touched = take(lines, targets)

@@ -163,8 +163,10 @@ class Lines:
 class Circles:
     """Circles: clusters of points after Eqs. (18)-(20), or fitted poles.
 
-    `fitted` tells which: a fitted circle is the pole itself and has a covariance, in two parts as that of a line; the
-    others describe the visible points and have none (zeros).
+    `fitted` tells which: a fitted circle is the pole itself; the others describe the visible points. In what one scan
+    holds both have a covariance, in two parts as that of a line: of the first the truth is the pole, of the second
+    what the same beams would give without noise. In a map the others have none (zeros): what is visible of a pole moves
+    with the viewpoint.
     """
 
     center: Float[Array, "K 2"]  # m, world

@@ -7,10 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import optimize
 
-from linemap_jax import Capacity, Extraction, Rules, Thresholds, extract
-from linemap_jax.core.circles import near_lines
-from linemap_jax.core.settings import SensorNoise
+from linemap_jax import Capacity, Extraction, Rules, Thresholds, empty_map, extract, update
+from linemap_jax.core.circles import jac_arc_points, near_lines
+from linemap_jax.core.runs import Runs
+from linemap_jax.core.settings import Jacobians, SensorNoise
 from linemap_jax.core.state import Circles, Pose, Scan, empty_circles, empty_lines
 
 CAPACITY = Capacity(4, 8)
@@ -29,9 +31,11 @@ def pole(center: tuple[float, float], radius: float) -> np.ndarray:
     return np.where(inside, along - np.sqrt(np.where(inside, radius**2 - across2, 0)), np.nan)
 
 
-def extracted(ranges: np.ndarray, fit: bool, pose: Pose = HERE) -> Extraction:
+def extracted(
+    ranges: np.ndarray, fit: bool, pose: Pose = HERE, noise: SensorNoise = NOISE, jacobians: Jacobians = "analytic"
+) -> Extraction:
     scan = Scan.from_ranges(ranges, BEARINGS)
-    return extract(scan, pose, noise=NOISE, thresholds=Thresholds(), capacity=CAPACITY, rules=Rules(fit_circles=fit))
+    return extract(scan, pose, noise=noise, capacity=CAPACITY, rules=Rules(fit_circles=fit), jacobians=jacobians)
 
 
 def only(found: Extraction) -> dict[str, Any]:
@@ -41,30 +45,96 @@ def only(found: Extraction) -> dict[str, Any]:
     return {name: np.asarray(getattr(found.circles, name))[slot] for name in names}
 
 
+def arc(ranges: np.ndarray, bearings: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Eqs. (18)-(20) to the letter."""
+    angle = bearings + pose[2]
+    points = ranges[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1) + pose[:2]
+    center = points.mean(0)
+    return np.array([*center, np.sqrt(np.sum((points - center) ** 2) / (len(points) - 1))])
+
+
 @pytest.mark.parametrize("x", [0.0, 1000.0])
 def test_equations_18_to_20(x: float) -> None:
     pose = Pose(mean=jnp.array([x, -3.0, 0.4]), cov=jnp.zeros((3, 3)))
     ranges = pole((2.0, 0.05), 0.12) + 0.004 * np.random.default_rng(0).standard_normal(N)
     circle = only(extracted(ranges, fit=False, pose=pose))
     hit = ~np.isnan(ranges)
-    angle = BEARINGS[hit] + 0.4
-    points = ranges[hit, None] * np.stack([np.cos(angle), np.sin(angle)], -1) + np.array([x, -3.0])
-    center = points.mean(0)
-    radius = np.sqrt(np.sum((points - center) ** 2) / (len(points) - 1))
+    *center, radius = arc(ranges[hit], BEARINGS[hit], np.array([x, -3.0, 0.4]))
     np.testing.assert_allclose(circle["center"], center, atol=1e-11 if x == 0 else 1e-9)
     np.testing.assert_allclose(circle["radius"], radius, rtol=1e-9)
     assert not circle["fitted"]
-    assert not circle["cov"].any()
+
+
+@pytest.mark.parametrize("jacobians", ["autodiff", "analytic"])
+def test_covariance_of_equations_18_to_20(jacobians: Jacobians) -> None:
+    ranges = pole((2.0, 0.05), 0.12) + 0.004 * np.random.default_rng(0).standard_normal(N)
+    mean, cov_pose = np.array([0.3, -3.0, 0.4]), np.diag([0.05, 0.02, 0.01]) ** 2
+    pose = Pose(mean=jnp.asarray(mean), cov=jnp.asarray(cov_pose))
+    found = extracted(ranges, fit=False, pose=pose, jacobians=jacobians)
+    circle = only(found)
+    hit = ~np.isnan(ranges)
+    x = np.concatenate([ranges[hit], BEARINGS[hit], mean])
+    n = hit.sum()
+
+    def moved(i: int, h: float) -> np.ndarray:
+        y = x + h * np.eye(len(x))[i]
+        return arc(y[:n], y[n : 2 * n], y[2 * n :])
+
+    jac = np.stack([(moved(i, 1e-6) - moved(i, -1e-6)) / 2e-6 for i in range(len(x))], -1)
+    first_order = jac[:, : 2 * n] @ np.diag(np.repeat([0.005**2, 0.001**2], n)) @ jac[:, : 2 * n].T
+    # Noise of variance v in each point widens the mean square distance from the centre by v.
+    wider = np.mean(0.005**2 + (0.001 * ranges[hit]) ** 2) - first_order[2, 2]
+    first_order[2, 2] += (wider / (2 * circle["radius"])) ** 2
+    np.testing.assert_allclose(circle["cov_independent"], first_order, rtol=1e-6, atol=1e-14)
+    by_pose = jac[:, 2 * n :] @ cov_pose @ jac[:, 2 * n :].T
+    np.testing.assert_allclose(circle["cov"] - first_order, by_pose, rtol=1e-6, atol=1e-12)
+
+
+def test_jacobians_of_arcs_are_interchangeable_and_finite() -> None:
+    random = np.random.default_rng(2)
+    position = jnp.asarray(np.concatenate([random.normal(0, 0.1, (12, 2)) + 3, np.ones((3, 2)), [[7, 7]]]))
+    first, last = jnp.array([0, 5, 12, 0]), jnp.array([4, 11, 14, 0])
+    of_point = jnp.array([0] * 5 + [1] * 7 + [2] * 3 + [-1])
+    runs = Runs(first=first, last=last, valid=jnp.array([True, True, True, False]), of_point=of_point)
+    both = [jac_arc_points(position, runs, jacobians=kind) for kind in ("autodiff", "analytic")]
+    assert np.isfinite(both).all()
+    np.testing.assert_allclose(both[0], both[1], atol=1e-12)
+    assert not np.any(both[1][12:15, 2])  # equal points have no radius
+    assert not np.any(both[1][15])
 
 
 def test_a_pole_is_fitted_exactly_without_noise() -> None:
-    found = extracted(pole((2.0, 0.0), 0.15), fit=True)
+    found = extracted(pole((2.0, 0.0), 0.15), fit=True, noise=SensorNoise(range_sigma=1e-5, bearing_sigma=1e-7))
     circle = only(found)
     assert circle["fitted"]
-    np.testing.assert_allclose(circle["center"], [2, 0], atol=1e-9)
-    np.testing.assert_allclose(circle["radius"], 0.15, atol=1e-9)
+    np.testing.assert_allclose(circle["center"], [2, 0], atol=1e-7)
+    np.testing.assert_allclose(circle["radius"], 0.15, atol=1e-7)
     hit = ~np.isnan(pole((2.0, 0.0), 0.15))
     np.testing.assert_array_equal(np.asarray(found.circle_of_beam) >= 0, hit)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_fit_is_the_most_likely_pole(seed: int) -> None:
+    # Away from the rim, and without noise of the bearing, the likelihood of a range needs no more than its formula.
+    center, radius, sigma = np.array([2.0, 0.1]), 0.2, 0.002
+    ranges = pole((2.0, 0.1), radius)
+    across = center[1] * np.cos(BEARINGS) - center[0] * np.sin(BEARINGS)
+    ranges = np.where(np.abs(across) < 0.8 * radius, ranges, np.nan)
+    ranges = ranges + sigma * np.random.default_rng(seed).standard_normal(N)
+    hit = ~np.isnan(ranges)
+
+    def residual(x: np.ndarray) -> np.ndarray:
+        along = x[0] * np.cos(BEARINGS[hit]) + x[1] * np.sin(BEARINGS[hit])
+        aside = x[1] * np.cos(BEARINGS[hit]) - x[0] * np.sin(BEARINGS[hit])
+        return (ranges[hit] - along + np.sqrt(x[2] ** 2 - aside**2)) / sigma
+
+    best = optimize.least_squares(residual, [*center, radius], xtol=1e-14, ftol=1e-14)
+    cov = np.linalg.inv(best.jac.T @ best.jac)
+    circle = only(extracted(ranges, fit=True, noise=SensorNoise(range_sigma=sigma, bearing_sigma=0.0)))
+    assert circle["fitted"]
+    error = np.array([*circle["center"], circle["radius"]]) - best.x
+    assert error @ np.linalg.solve(cov, error) < 0.1**2
+    np.testing.assert_allclose(circle["cov"], cov, atol=0.05 * cov.max())
 
 
 def test_the_papers_circle_lies_before_the_pole() -> None:
@@ -104,7 +174,9 @@ def test_covariance_of_a_fit_holds_the_pose() -> None:
     circle = only(extracted(ranges, fit=True, pose=Pose(mean=jnp.zeros(3), cov=cov)))
     alone, with_pose = only(extracted(ranges, fit=True))["cov"], circle["cov"]
     # The pole is 2 m ahead: the heading moves it sideways by 2 m times as much; its radius stays.
-    np.testing.assert_allclose(with_pose - alone, np.diag([0.05**2, 0.02**2 + 0.02**2, 0]), atol=1e-10)
+    away = circle["center"][0]
+    assert away == pytest.approx(2, abs=2e-3)
+    np.testing.assert_allclose(with_pose - alone, np.diag([0.05**2, 0.02**2 + (0.01 * away) ** 2, 0]), atol=1e-12)
     assert np.all(np.linalg.eigvalsh(alone) > 0)
     # Only the sensor's part is the scan's own.
     np.testing.assert_allclose(circle["cov_independent"], alone, atol=1e-12)
@@ -139,6 +211,23 @@ def test_a_far_point_begins_a_cluster() -> None:
     assert int(found.circles.valid.sum()) == 2
     slot = np.asarray(found.circle_of_beam)
     assert slot[20] == slot[24] == slot[28] != slot[60] == slot[64]
+
+
+def test_only_a_pole_has_a_covariance_in_the_map() -> None:
+    ranges = pole((2.0, 0.0), 0.15)
+    scan = Scan.from_ranges(ranges, BEARINGS)
+    pose = Pose(mean=jnp.zeros(3), cov=jnp.diag(jnp.array([0.05, 0.02, 0.01])) ** 2)
+    for fit in (True, False):
+        line_map = empty_map(Capacity(4, 4))
+        for times in (1, 2):
+            rules = Rules(fit_circles=fit)
+            line_map, _ = update(
+                line_map, scan, pose, noise=NOISE, rules=rules, capacity=CAPACITY, jacobians="analytic"
+            )
+            circles = line_map.circles
+            assert (int(circles.times_detected[0]), bool(circles.fitted[0])) == (times, fit)
+            assert bool(circles.cov_independent[0].any()) == fit
+            assert bool(circles.sqrt_persistent[0].any()) == fit
 
 
 def circle_at(x: float, y: float, radius: float, fitted: bool) -> Circles:

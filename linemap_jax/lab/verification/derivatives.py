@@ -461,9 +461,9 @@ def _circle_of_points(x: Float[Array, " n"], count: Int[Array, ""]) -> Float[Arr
         spacing=jnp.array(0.01),
     )
     all_join = Thresholds(cluster_distance=1e6)
-    _, running = circles.cluster(points, valid, all_join)
     at = Pose(mean=jnp.zeros(3), cov=jnp.zeros((3, 3)))
-    found = circles.measure_circles(points, at, _run(count, n), running, all_join, SensorNoise(), fit=False)
+    run = _run(count, n)
+    found = circles.measure_circles(points, at, run, all_join, SensorNoise(), fit=False, jacobians="analytic")
     return jnp.concatenate([found.center[0], found.radius])
 
 
