@@ -31,6 +31,8 @@ EDGE_ON = 1e-3
 # The end of a grazed line is uncertain by at most this much of a beam: the smallest |normal . u| that is used.
 GRAZING = 0.1
 GAUSS_NEWTON_STEPS = 5
+# How near to the rim a beam is taken to meet a pole at least, in sigmas.
+RIM = 0.5
 FEWEST_CIRCLE_POINTS = 5
 # Points closer than this (sigmas) to the line beside their own may be that line's.
 CORNER_SIGMAS = 3.0
@@ -698,16 +700,16 @@ class CircleFit(NamedTuple):
 
 
 def fit_circle(
-    z: np.ndarray, u: np.ndarray, r: np.ndarray, *, sr: float, sa: float, margin: Margin
+    z: np.ndarray, u: np.ndarray, laser: np.ndarray, *, sr: float, sa: float, margin: Margin
 ) -> CircleFit | None:
-    """A circle through points about their centroid: Kasa's start, then Gauss-Newton on the distances.
+    """The most likely circle of points about their centroid: Kasa's start, then Gauss-Newton on the likelihood.
 
     Not in the paper, whose Eqs. (18)-(20) describe the visible arc.
 
     Args:
       z: points relative to their centroid. Shape `[n, 2]`.
       u: directions of their beams. Shape `[n, 2]`.
-      r: ranges, m. Shape `[n]`.
+      laser: relative to the centroid. Shape `[2]`.
       sr: sigma of a range, m.
       sa: sigma of a bearing, rad.
       margin: notes how clear the decisions were.
@@ -725,33 +727,53 @@ def fit_circle(
     if sxx + syy == 0 or not margin.below(FLAT, det / (sxx + syy) ** 2):
         return None
     c = np.array([bx * syy - by * sxy, by * sxx - bx * sxy]) / det
-    radius = math.sqrt(w.mean() + c @ c)
-    # A step may run away or hit a point; then there is no fit, and no need for a warning.
+    state = np.array([*c, math.sqrt(w.mean() + c @ c)])
+    # A step may run away; then it is not taken, and there is no need for a warning.
     with np.errstate(all="ignore"):
         try:
             for _ in range(GAUSS_NEWTON_STEPS):
-                f, e, a = _circle_residuals(z, c, radius)
-                delta = -np.linalg.solve(a.T @ a, a.T @ f)
-                c, radius = c + delta[:2], radius + float(delta[2])
-            f, e, a = _circle_residuals(z, c, radius)
-            b = np.linalg.solve(a.T @ a, a.T)
+                information, gradient, _ = _circle_likelihood(z, u, laser, state, sr=sr, sa=sa)
+                improved = state + np.linalg.solve(information, gradient)
+                if np.isfinite(improved).all() and improved[2] > 0:
+                    state = improved
+            information, _, chi2 = _circle_likelihood(z, u, laser, state, sr=sr, sa=sa)
+            cov = symmetric(np.linalg.inv(information))
         except np.linalg.LinAlgError:
             return None
-        cos2 = dot(e, u) ** 2
-        v = sr**2 * cos2 + r**2 * sa**2 * (1 - cos2)
-        cov = symmetric((b * v) @ b.T)
-        chi2 = float((f**2 / v).sum())
-    if not (np.isfinite(c).all() and math.isfinite(radius) and np.isfinite(cov).all() and math.isfinite(chi2)):
+    if not (np.isfinite(state).all() and np.isfinite(cov).all() and math.isfinite(chi2)):
         return None
-    return CircleFit(c, radius, cov, chi2)
+    if not (np.diag(cov) > 0).all():
+        return None
+    return CircleFit(state[:2], float(state[2]), cov, chi2)
 
 
-def _circle_residuals(z: np.ndarray, c: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Distances from the circle, directions from its centre, and the Jacobian of the distances by (x, y, R)."""
-    away = z - c
-    far = np.hypot(*away.T)
-    e = away / far[:, None]
-    return far - radius, e, np.concatenate([-e, -np.ones((len(z), 1))], 1)
+def _circle_likelihood(
+    z: np.ndarray, u: np.ndarray, laser: np.ndarray, state: np.ndarray, *, sr: float, sa: float
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Information, gradient and misfit of the points, beam by beam; each beam is known to have met the pole."""
+    c, radius = state[:2], float(state[2])
+    information, gradient, chi2 = np.zeros((3, 3)), np.zeros(3), 0.0
+    for point, beam in zip(z, u, strict=True):
+        across = np.array([-beam[1], beam[0]])
+        ahead, aside = float(beam @ (c - laser)), float(-across @ (c - laser))
+        sway = abs(ahead) * sa
+        # Mean and variance of a normal sway that has not carried the beam over the rim
+        t = max((radius - abs(aside)) / sway, -4.0) if sway > 0 else 9.0
+        hazard = math.exp(-t * t / 2) / math.sqrt(2 * math.pi) / (math.erfc(-t / math.sqrt(2)) / 2)
+        inward, spread = sway * hazard, 1 - hazard * (t + hazard)
+        sine = min(max((abs(aside) - inward) / radius, 0.0), 1.0)
+        cos2 = max(1 - sine**2, min(2 * RIM * (sr + sway) / radius, 1.0))
+        cos, sine = math.sqrt(cos2), math.sqrt(1 - cos2)
+        normal = -cos * beam + math.copysign(sine, aside) * across
+        var_sway = ((ahead - radius * cos) * sa) ** 2
+        mean = sine * inward + ((1 - cos2) * sr**2 - (2 - cos2) * var_sway) / (2 * radius)
+        weight = 1 / (cos2 * sr**2 + (1 - cos2) * spread * var_sway)
+        row = np.array([*normal, 1.0]) * (1 - sine * (1 - spread))
+        residual = float(np.hypot(*(point - c))) - radius - mean
+        information += weight * np.outer(row, row)
+        gradient += weight * residual * row
+        chi2 += weight * residual**2
+    return information, gradient, chi2
 
 
 def _circle_of_cluster(
@@ -762,21 +784,22 @@ def _circle_of_cluster(
     n = len(cluster)
     centroid = o[0] + (o - o[0]).mean(0)
     z = o - centroid
+    radius = math.sqrt((z**2).sum() / (n - 1))
     plain = {
         "center": sweep.p + centroid,
-        "radius": math.sqrt((z**2).sum() / (n - 1)),
-        "cov_independent": np.zeros((3, 3)),
-        "sqrt_persistent": np.zeros((3, 3)),
+        "radius": radius,
+        "cov_independent": _cov_of_arc(z, radius, jac_point_measurement(r, u), sr=sweep.sr, sa=sweep.sa),
+        "sqrt_persistent": _jac_circle_pose(centroid) @ lower_root(sweep.cov_pose),
         "fitted": False,
     }
     if not rules.fit_circles:
         return plain
-    fit = fit_circle(z, u, r, sr=sweep.sr, sa=sweep.sa, margin=margin)
+    fit = fit_circle(z, u, sweep.laser - centroid, sr=sweep.sr, sa=sweep.sa, margin=margin)
     if fit is None:
         return plain
     sight = (centroid - sweep.laser) / np.hypot(*(centroid - sweep.laser))
     good = (
-        not margin.below(fit.radius, 5 * sweep.sr)
+        not margin.below(fit.radius + 3 * math.sqrt(fit.cov[2, 2]), 5 * sweep.sr)
         and margin.below(fit.radius, float(thresholds.cluster_distance))
         and margin.below(0.0, sight @ fit.center)
         and not margin.below(n - 3 + 3 * math.sqrt(2 * (n - 3)), fit.chi2)
@@ -785,15 +808,35 @@ def _circle_of_cluster(
     if not good:
         return plain
     center = centroid + fit.center
-    q = np.zeros((3, 3))
-    q[:2] = jac_point_pose(center)
     return {
         "center": sweep.p + center,
         "radius": fit.radius,
         "cov_independent": fit.cov,
-        "sqrt_persistent": q @ lower_root(sweep.cov_pose),
+        "sqrt_persistent": _jac_circle_pose(center) @ lower_root(sweep.cov_pose),
         "fitted": True,
     }
+
+
+def _cov_of_arc(z: np.ndarray, radius: float, g: np.ndarray, *, sr: float, sa: float) -> np.ndarray:
+    """Covariance of Eqs. (18)-(20) from the sensor's noise, and the square of what noise adds to the radius."""
+    n, c_s = len(z), np.diag([sr**2, sa**2])
+    cov, of_points = np.zeros((3, 3)), 0.0
+    for point, g_i in zip(z, g, strict=True):
+        of_point = g_i @ c_s @ g_i.T
+        by_radius = point / ((n - 1) * radius) if radius > 0 else np.zeros(2)
+        j = np.vstack([np.eye(2) / n, by_radius])
+        cov += j @ of_point @ j.T
+        of_points += np.trace(of_point) / n
+    if radius > 0:
+        cov[2, 2] += (max(of_points - cov[2, 2], 0.0) / (2 * radius)) ** 2
+    return symmetric(cov)
+
+
+def _jac_circle_pose(center: np.ndarray) -> np.ndarray:
+    """d(x, y, radius) / d(pose) of a circle, relative to the robot."""
+    q = np.zeros((3, 3))
+    q[:2] = jac_point_pose(center)
+    return q
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -1566,8 +1609,10 @@ def _fuse_circle(
     if not rules.weigh_circles:
         state = (mean + old) / 2
     elif fitted and is_fitted:
-        gain, error = combine(error, _error_of(found, fitted[0]), pose_error)
-        state = old + gain @ (_circle_state(found, fitted[0]) - old)
+        new, seen = _error_of(found, fitted[0]), _circle_state(found, fitted[0])
+        gain, error = combine(error, _at_radius(new, seen[2], old[2]), pose_error)
+        state = old + gain @ (seen - old)
+        error = _at_radius(error, old[2], state[2])
     elif fitted:
         state, error, is_fitted = _circle_state(found, fitted[0]), _error_of(found, fitted[0]), True
     elif not is_fitted:
@@ -1575,6 +1620,14 @@ def _fuse_circle(
     _put(circles, slot, center=state[:2], radius=state[2], fitted=is_fitted)
     _put(circles, slot, cov_independent=error.c, sqrt_persistent=error.a)
     circles.times_detected[slot] += 1
+
+
+def _at_radius(error: Error, radius: float, other: float) -> Error:
+    """The error of a fitted circle if its radius were another one: the variance of the curvature stays as it is."""
+    c = error.c
+    if not (radius > 0 and other > 0 and c[2, 2] > 0):
+        return error
+    return error._replace(c=c + ((other / radius) ** 4 - 1) * np.outer(c[:, 2], c[2]) / c[2, 2])
 
 
 def _update_circles(
@@ -1629,8 +1682,10 @@ def _update_circles(
         if slot is None:
             report.status |= Status.MAP_CIRCLES_FULL
             continue
-        fields = ("center", "radius", "cov_independent", "sqrt_persistent", "fitted")
-        _put(circles, slot, times_detected=1, valid=True, **{name: getattr(new, name)[i] for name in fields})
+        state = {name: getattr(new, name)[i] for name in ("center", "radius", "fitted")}
+        # What is visible of a pole moves with the viewpoint: in a map it has no covariance.
+        errors = {name: getattr(new, name)[i] * new.fitted[i] for name in ("cov_independent", "sqrt_persistent")}
+        _put(circles, slot, times_detected=1, valid=True, **state, **errors)
         report.circle_slot[i] = NEW
         report.added += 1
 

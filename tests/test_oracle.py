@@ -1,6 +1,5 @@
 """The pipeline against the plain NumPy reading in `oracle.py`, on real logs."""
 
-import dataclasses
 from functools import partial
 from typing import Any
 
@@ -20,15 +19,6 @@ EVERY = {"intel": 3, "aces": 3, "fhw": 3, "freiburg-079": 24}
 """Every n-th scan is compared: the oracle takes 5 ms for one."""
 
 
-def options_of(name: Any) -> dict[str, Any]:
-    """A preset, with circles after Eqs. (18)-(20): the oracle does not read the most likely circle.
-
-    That one is held against simulations, in `core/test_circles.py` and `lab/test_consistency_of_circles.py`.
-    """
-    options = preset(name)
-    return options | {"rules": dataclasses.replace(options["rules"], fit_circles=False)}
-
-
 def oracle_options(options: dict[str, Any]) -> dict[str, Any]:
     """The options of `update` as the oracle takes them."""
     return options | {"noise": SensorNoise(), "mount": Mount()}
@@ -42,14 +32,14 @@ def fields(scan: Any) -> tuple[Any, ...]:
 @partial(jax.jit, static_argnames=("name", "jacobians"))
 def extract_all(scans: Any, poses: Any, name: str, jacobians: str = "autodiff") -> Any:
     """Extraction of a stack of scans with a preset."""
-    one_scan = partial(extract, capacity=SCAN, jacobians=jacobians, **options_of(name))
+    one_scan = partial(extract, capacity=SCAN, jacobians=jacobians, **preset(name))
     return jax.lax.map(lambda x: one_scan(*x), (scans, poses))
 
 
 @pytest.mark.parametrize("name", ["default", "paper"])
 @pytest.mark.parametrize("log", LOGS)
 def test_extraction_is_that_of_the_oracle(log: str, name: str) -> None:
-    options = options_of(name)
+    options = preset(name)
     scans, poses = scans_of(log, slice(None, None, EVERY[log]))
     found = jax.tree.map(np.asarray, extract_all(scans, poses, name))
     options = oracle_options(options)
@@ -79,6 +69,8 @@ def test_extraction_is_that_of_the_oracle(log: str, name: str) -> None:
         np.testing.assert_array_equal(mine.circles.fitted[kept], theirs.circles.fitted)
         np.testing.assert_allclose(mine.circles.center[kept], theirs.circles.center, atol=1e-8)
         np.testing.assert_allclose(mine.circles.radius[kept], theirs.circles.radius, atol=1e-8)
+        np.testing.assert_allclose(mine.circles.cov_independent[kept], theirs.circles.cov_independent, atol=1e-8)
+        np.testing.assert_allclose(mine.circles.sqrt_persistent[kept], theirs.circles.sqrt_persistent, atol=1e-8)
 
 
 @pytest.mark.parametrize("log", LOGS)
@@ -86,7 +78,7 @@ def test_float32_extraction_is_that_of_the_oracle(log: str) -> None:
     scans, poses = scans_of(log, slice(None, None, 4 * EVERY[log]))
     lower = jax.tree.map(lambda x: x.astype("float32") if x.dtype == np.float64 else x, (scans, poses))
     found = jax.tree.map(np.asarray, extract_all(*lower, "default"))
-    options = oracle_options(options_of("default"))
+    options = oracle_options(preset("default"))
     same = total = 0
     for t in range(len(found.status)):
         scan, pose, mine = one(lower[0], t), one(lower[1], t), one(found, t)
@@ -112,7 +104,7 @@ PERSISTENCE = Persistence(share=0.7, correlation=0.95)
 @partial(jax.jit, static_argnames=("name", "pose_error"), compiler_options={"xla_cpu_use_fusion_emitters": False})
 def update_all(line_map: Any, scans: Any, poses: Any, name: str, pose_error: str) -> Any:
     """The map after each scan, and the reports."""
-    options = options_of(name) | {"pose_error": pose_error, "persistence": PERSISTENCE}
+    options = preset(name) | {"pose_error": pose_error, "persistence": PERSISTENCE}
 
     def step(line_map: Any, x: Any) -> Any:
         line_map, report = update(line_map, *x, capacity=SCAN, **options)
@@ -135,7 +127,7 @@ def update_all(line_map: Any, scans: Any, poses: Any, name: str, pose_error: str
 def test_map_is_that_of_the_oracle_slot_by_slot(log: str, name: str, pose_error: str, count: int) -> None:
     scans, poses = scans_of(log, slice(count))
     maps, reports = jax.tree.map(np.asarray, update_all(empty_map(MAP, np.float64), scans, poses, name, pose_error))
-    options = oracle_options(options_of(name)) | {"pose_error": pose_error, "persistence": PERSISTENCE}
+    options = oracle_options(preset(name)) | {"pose_error": pose_error, "persistence": PERSISTENCE}
     theirs = oracle.empty_map(MAP)
     for t in range(count):
         scan, pose = one(scans, t), one(poses, t)

@@ -14,7 +14,7 @@ import jax.scipy.special
 from jaxtyping import Array, Bool, Float, Int
 
 from linemap_jax.core.frames import dot, perp
-from linemap_jax.core.propagation import apply, inverse, product, square_root, symmetric
+from linemap_jax.core.propagation import apply, inverse, product, safe_sqrt, square_root, symmetric
 from linemap_jax.core.runs import Runs
 from linemap_jax.core.sensor import Points
 from linemap_jax.core.settings import Jacobians, SensorNoise, Thresholds
@@ -31,7 +31,7 @@ RIM = 0.5
 have all the weight, and where the rim is we do not know that well."""
 
 
-class Cluster(NamedTuple):
+class _Cluster(NamedTuple):
     """The cluster under extraction, as it stands at some point; sums are from its first point."""
 
     n: Array  # number of points
@@ -39,10 +39,11 @@ class Cluster(NamedTuple):
     y0: Array
     x: Array  # sums of Eq. (18)
     y: Array
-    xxyy: Array  # sum of x^2 + y^2, for Eq. (20)
 
 
-def cluster(points: Points, free: Bool[Array, " N"], thresholds: Thresholds) -> tuple[Bool[Array, " N"], Cluster]:
+def cluster(
+    points: Points, free: Bool[Array, " N"], thresholds: Thresholds
+) -> tuple[Bool[Array, " N"], Float[Array, " N"]]:
     """Section 4.3.1: consecutive points that no line took, each near the centre of those before it.
 
     Args:
@@ -51,11 +52,11 @@ def cluster(points: Points, free: Bool[Array, " N"], thresholds: Thresholds) -> 
       thresholds: `cluster_distance`.
 
     Returns:
-      Which points are the last of their cluster, shape `[N]`; the cluster as it stood at each point, each field `[N]`.
+      Which points are the last of their cluster; how many points it had when it stood at each point. Shapes `[N]`.
     """
 
     def body(carry: Array, row: Array) -> tuple[Array, Array]:
-        c = Cluster(*carry)
+        c = _Cluster(*carry)
         px, py, is_free = row
         n = jnp.maximum(c.n, 1)
         x, y = px - c.x0, py - c.y0
@@ -65,16 +66,15 @@ def cluster(points: Points, free: Bool[Array, " N"], thresholds: Thresholds) -> 
         x0, y0 = jnp.where(joins, c.x0, px), jnp.where(joins, c.y0, py)
         x, y = px - x0, py - y0
         old = jnp.where(joins, 1, 0).astype(carry.dtype)
-        joined = [c.n * old + 1, x0, y0, c.x * old + x, c.y * old + y, c.xxyy * old + (x * x + y * y)]
+        joined = [c.n * old + 1, x0, y0, c.x * old + x, c.y * old + y]
         carry = jnp.stack(joined) * is_free  # a point of a line ends the cluster
-        return carry, carry
+        return carry, carry[0]
 
-    start = jnp.zeros(len(Cluster._fields), points.range.dtype)
+    start = jnp.zeros(len(_Cluster._fields), points.range.dtype)
     rows = jnp.concatenate([points.position, free.astype(start.dtype)[:, None]], -1)
-    _, running = jax.lax.scan(body, start, rows)
-    running = Cluster(*jnp.moveaxis(running, -1, 0))
-    goes_on = jnp.concatenate([running.n[1:] > 1, jnp.zeros(1, bool)])
-    return free & ~goes_on, running
+    _, count = jax.lax.scan(body, start, rows)
+    goes_on = jnp.concatenate([count[1:] > 1, jnp.zeros(1, bool)])
+    return free & ~goes_on, count
 
 
 def arcs_from_points(position: Float[Array, "N 2"], clusters: Runs) -> Float[Array, "3 K"]:
@@ -93,9 +93,7 @@ def arcs_from_points(position: Float[Array, "N 2"], clusters: Runs) -> Float[Arr
     sums = clusters.sum(jnp.concatenate([z, dot(z, z)[:, None]], -1))
     n = _count(clusters).astype(sums.dtype)
     centroid = sums[:, :2] / n[:, None]
-    variance = (sums[:, 2] - n * dot(centroid, centroid)) / (n - 1)
-    positive = variance > 0
-    radius = jnp.where(positive, jnp.sqrt(jnp.where(positive, variance, 1)), 0)
+    radius = safe_sqrt((sums[:, 2] - n * dot(centroid, centroid)) / (n - 1))
     return jnp.concatenate([(origin + centroid).T, radius[None]])
 
 
@@ -223,7 +221,7 @@ def _fit_circles(
     solvable = (n >= MIN_FIT_POINTS) & (det > 1e-6 * (sxx + syy) ** 2)
     safe = jnp.where(solvable, det, 1)
     a, b = (bx * syy - by * sxy) / safe, (by * sxx - bx * sxy) / safe
-    circle = jnp.stack([a, b, jnp.sqrt(sw / n + a * a + b * b)], -1)
+    circle = jnp.stack([a, b, safe_sqrt(sw / n + a * a + b * b)], -1)
     circle = jnp.where(solvable[:, None], circle, jnp.ones_like(circle))
     laser = points.laser[None] - middle
 
@@ -254,14 +252,16 @@ def _fit_circles(
 
     center, radius = circle[:, :2], circle[:, 2]
     dof = jnp.maximum(n - 3, 1)
-    var_radius = jnp.maximum(cov[:, 2, 2], 0)
+    variances = jnp.diagonal(cov, axis1=-2, axis2=-1)
+    var_radius = variances[:, 2]
     believed = (
         solvable
         & jnp.all(jnp.isfinite(circle), -1)
         & jnp.all(jnp.isfinite(cov), (-1, -2))
+        & jnp.all(variances > 0, -1)  # rounding has the last word where the beams say nothing of a direction
         # Smaller ones are lost in the noise. Held against the estimate itself, poles of just this radius would be kept
         # if they seem too large and turned away if they seem too small, and come out too large.
-        & (radius + 3 * jnp.sqrt(var_radius) >= 5 * noise.range_sigma)
+        & (radius + 3 * safe_sqrt(var_radius) >= 5 * noise.range_sigma)
         & (radius < thresholds.cluster_distance)
         & (dot(-laser, center) > 0)  # we see the near side of a pole, never its inside
         & (misfit <= dof + 3 * jnp.sqrt(2 * dof))  # 3 sigma of chi-square
@@ -306,7 +306,7 @@ def _linearise(
     sine = jnp.clip((jnp.abs(aside) - inward) / radius, 0, 1)
     least = jnp.minimum(2 * RIM * (noise.range_sigma + sway) / radius, 1)
     cosine2 = jnp.maximum(1 - sine**2, least)
-    cosine, sine = jnp.sqrt(cosine2), jnp.sqrt(1 - cosine2)
+    cosine, sine = safe_sqrt(cosine2), safe_sqrt(1 - cosine2)
     normal = -cosine[:, None] * beam + (jnp.sign(aside) * sine)[:, None] * perp(beam)
 
     var_range = noise.range_sigma**2
@@ -316,7 +316,7 @@ def _linearise(
     row = jnp.concatenate([normal, jnp.ones_like(normal[:, :1])], -1) * (1 - sine * (1 - spread))[:, None]
     to_point = z - c
     return _Beams(
-        residual=jnp.sqrt(dot(to_point, to_point)) - radius - mean,
+        residual=safe_sqrt(dot(to_point, to_point)) - radius - mean,
         row=row,
         weight=1 / jnp.where(variance > 0, variance, 1),
     )

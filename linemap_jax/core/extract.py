@@ -6,13 +6,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from linemap_jax.core import circles as circles_
 from linemap_jax.core.lines import MIN_POINTS, length_of_run, measure_lines, without_corner_points
 from linemap_jax.core.runs import select_runs
 from linemap_jax.core.segmentation import incremental
-from linemap_jax.core.segmentation.incremental import Run
 from linemap_jax.core.sensor import Points, points_from_scan
 from linemap_jax.core.settings import (
     SCAN_CAPACITY,
@@ -127,17 +126,17 @@ def extract_points(
         jacobians=jacobians,
     )
 
-    cluster_ends, cluster = circles_.cluster(points, points.valid & (runs.of_point < 0), thresholds)
-    lone = cluster.n < 2
-    clusters, circles_full = select_runs(cluster.n, cluster_ends & ~lone, capacity.circles)
+    cluster_ends, size = circles_.cluster(points, points.valid & (runs.of_point < 0), thresholds)
+    lone = size < 2
+    clusters, circles_full = select_runs(size, cluster_ends & ~lone, capacity.circles)
     circles = circles_.measure_circles(
         points, pose, clusters, thresholds, noise, fit=rules.fit_circles, jacobians=jacobians
     )
     near = circles_.near_lines(circles, lines, thresholds)
     circles = dataclasses.replace(circles, valid=circles.valid & ~near)
 
-    def points_of(run: Run | circles_.Cluster, which: Bool[Array, " N"]) -> Int[Array, ""]:
-        return jnp.sum(jnp.where(which, run.n, 0)).astype(jnp.int32)
+    def points_of(count: Float[Array, " N"], ends: Bool[Array, " N"]) -> Int[Array, ""]:
+        return jnp.sum(jnp.where(ends, count, 0)).astype(jnp.int32)
 
     status = jnp.where(lines_full, int(Status.SCAN_LINES_FULL), 0)
     status |= jnp.where(circles_full, int(Status.SCAN_CIRCLES_FULL), 0)
@@ -155,9 +154,9 @@ def extract_points(
             gap=breaks[0],
             distance=breaks[1],
             bearing=breaks[2],
-            too_few=points_of(run, ends & few),
-            too_short=points_of(run, ends & ~few & short),
-            lone=points_of(cluster, cluster_ends & lone),
+            too_few=points_of(run.n, ends & few),
+            too_short=points_of(run.n, ends & ~few & short),
+            lone=points_of(size, cluster_ends & lone),
             near_line=jnp.sum(in_cluster & ~modelled, dtype=jnp.int32),
         ),
         status=status.astype(jnp.int32),

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from linemap_jax.core.frames import dot, shift_matrix, wrap_angle
 from linemap_jax.core.matching import CircleMatches, compare_lines, with_sign
-from linemap_jax.core.propagation import apply, inverse, product, propagate, square_root, symmetric
+from linemap_jax.core.propagation import apply, inverse, product, propagate, safe_sqrt, square_root, symmetric
 from linemap_jax.core.settings import Number, PoseError, Rules, Thresholds
 from linemap_jax.core.slots import choose, least, take
 from linemap_jax.core.state import Circles, Lines, pytree, squared
@@ -109,10 +109,7 @@ def forget(primitives: ErrorsT, share: Number) -> ErrorsT:
 
 def _size(cov: Float[Array, "*s n n"], unit: Float[Array, "*s n n"]) -> Float[Array, "*s"]:
     """The square root of the trace of a covariance, measured by an information matrix."""
-    trace = jnp.sum(cov * unit, (-1, -2))
-    positive = trace > 0
-    # Twice, so that the gradient at zero is finite.
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, trace, 1)), 0)
+    return safe_sqrt(jnp.sum(cov * unit, (-1, -2)))
 
 
 def fuse_lines(

@@ -80,13 +80,18 @@ def square_root(matrix: Float[Array, "*s n n"]) -> Float[Array, "*s n n"]:
     lower = [[jnp.zeros_like(matrix[..., 0, 0])] * n for _ in range(n)]
     for j in range(n):
         left = matrix[..., j, j] - sum(lower[j][k] ** 2 for k in range(j))
-        positive = left > 0
-        # Twice, so that the gradient of the branch not taken is finite.
-        lower[j][j] = jnp.where(positive, jnp.sqrt(jnp.where(positive, left, 1)), 0)
-        scale = jnp.where(positive, 1 / jnp.where(positive, lower[j][j], 1), 0)
+        lower[j][j] = safe_sqrt(left)
+        scale = jnp.where(left > 0, 1 / jnp.where(left > 0, lower[j][j], 1), 0)
         for i in range(j + 1, n):
             lower[i][j] = (matrix[..., i, j] - sum(lower[i][k] * lower[j][k] for k in range(j))) * scale
     return _from_rows(lower)
+
+
+def safe_sqrt(x: Float[Array, "*s"]) -> Float[Array, "*s"]:
+    """The square root; of what is not positive it is zero, with a gradient of zero."""
+    positive = x > 0
+    # Twice, so that the gradient of the branch not taken is finite.
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1)), 0)
 
 
 def quadratic(vector: Float[Array, "*s n"], matrix: Float[Array, "*s n n"]) -> Float[Array, "*s"]:

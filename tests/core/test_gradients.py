@@ -82,16 +82,8 @@ def assert_finite(gradient: Any) -> None:
         assert np.isfinite(leaf).all(), jax.tree_util.keystr(path)
 
 
-CIRCLE_FIT = pytest.mark.xfail(strict=True, reason="square roots of zero in the fit of circles that are not there")
-
-
 @pytest.mark.parametrize(
-    ("name", "jacobians"),
-    [
-        pytest.param("default", "autodiff", marks=CIRCLE_FIT),
-        pytest.param("default", "analytic", marks=CIRCLE_FIT),
-        ("paper", "analytic"),
-    ],
+    ("name", "jacobians"), [("default", "autodiff"), ("default", "analytic"), ("paper", "analytic")]
 )
 def test_gradients_of_an_extraction_are_finite(name: str, jacobians: str) -> None:
     gradient = jax.jit(jax.grad(of_extraction, range(5)), static_argnames=("name", "jacobians"))
