@@ -118,7 +118,7 @@ def compare_extraction(log: Any, choice: Literal["default", "paper"]) -> list[st
             pairs = same_beams(mine.line_of_beam, theirs.line_of_beam)
             equal += len(pairs)
             other += max(int(mine.lines.valid.sum()), len(theirs.lines.offset)) - len(pairs)
-            if not np.array_equal(mine.line_of_beam, theirs.line_of_beam):
+            if not np.array_equal(oracle.compact(mine.line_of_beam, mine.lines.valid), theirs.line_of_beam):
                 unequal += 1
                 undecided += theirs.deciding_margin < 1e-9
             if pairs:

@@ -1,14 +1,15 @@
 """Whether the covariances hold: the tables in README, measured by simulation.
 
-Usage: python scripts/measure_consistency.py [--runs N] [--fused-runs N] [--write]
+Usage: python scripts/measure_consistency.py [--runs N] [--fused-runs N] [--devices N] [--write]
 
-The cells are those of `linemap_jax.lab.consistency.scenes`: walls and rooms, two noises of the range, two of the
-bearing, three errors of the pose; 361 beams. Whatever leaves its band is printed cell by cell. The whole takes about
-half an hour on two cores. With --write the tables go into README, between the markers.
+The cells are those of `linemap_jax.lab.consistency.cells`: walls and rooms, two noises of the range, two of the
+bearing, three errors of the pose; 361 beams. Poles stand at 2 and 5 m. Whatever leaves its band is printed cell by
+cell. With --write the tables go into README, between the markers.
 """
 
 import argparse
 import sys
+import time
 import zlib
 from collections.abc import Callable, Iterable
 from functools import partial
@@ -22,6 +23,7 @@ from tqdm import tqdm
 from linemap_jax import preset
 from linemap_jax.core.settings import Persistence
 from linemap_jax.lab import consistency
+from linemap_jax.lab.batch import mesh_of_devices, run_batch
 from linemap_jax.lab.consistency import Cell, Fit, Model, Sample, Verdict, judge
 
 README = Path(__file__).resolve().parents[1] / "README.md"
@@ -39,11 +41,21 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--runs", type=int, default=10_000, help="runs in each cell, of one scan")
     parser.add_argument("--fused-runs", type=int, default=1_000, help="runs in each cell, of fifty scans")
+    parser.add_argument("--devices", type=int, default=2, help="processors to use")
     parser.add_argument("--write", action="store_true", help="put the tables into README")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    text = "\n\n".join([single_scans(options.runs), fused_scans(options.fused_runs)])
-    print(text)
+    jax.config.update("jax_num_cpu_devices", options.devices)
+    begin = time.perf_counter()
+    tables = []
+    for measure, runs in (
+        (single_scans, options.runs),
+        (fused_scans, options.fused_runs),
+    ):
+        tables.append(measure(runs))
+        print(tables[-1], flush=True)
+    minutes = (time.perf_counter() - begin) / 60
+    text = "\n\n".join([*tables, f"Measured in {minutes:.0f} minutes on {options.devices} cores."])
     if options.write:
         before, rest = README.read_text().split(BEGIN)
         README.write_text(f"{before}{BEGIN}\n{text}\n{END}{rest.split(END)[1]}")
@@ -71,23 +83,29 @@ def single_scans(runs: int) -> str:
     lines = [
         f"{len(cells)} cells of {runs} runs, one line a run. If a covariance holds, all means lie in "
         f"[{band.mean[0]:.3f}, {band.mean[1]:.3f}] and all coverages in [{band.inside[0]:.3f}, {band.inside[1]:.3f}] "
-        "with a probability of 0.999.",
+        "with a probability of 0.999. All lines of a scan hold if 93 % are inside and the median is within 10 % of "
+        "1.386.",
         "",
         header,
         "| --- | --- | --- | --- | ---: |",
     ]
     for name, title in titles.items():
         of_cells = verdicts[name]
-        inside = [consistency.holds(v, band) for v in of_cells]
+        inside = [holds_for_all(v) if name.endswith("all") else consistency.holds(v, band) for v in of_cells]
         lines.append(
             f"| {title} | {_range(v.mean for v in of_cells)} | {_range(v.median for v in of_cells)} | "
             f"{_range((v.inside for v in of_cells), 3)} | {sum(inside)} of {len(cells)} |"
         )
-        if name in (Fit.DEFAULT.value, "longest"):
+        if name in (Fit.DEFAULT.value, "longest", "all"):
             for cell, verdict, good in zip(cells, of_cells, inside, strict=True):
                 if not good:
-                    print(f"out of band: {title}: {cell}: {verdict}", file=sys.stderr)
+                    print(f"out of band: {title}: {cell}: {_short(verdict)}", file=sys.stderr)
     return "\n".join(lines)
+
+
+def holds_for_all(verdict: Verdict) -> bool:
+    """What is asked of all lines: some of them are made of few points, chosen by noise."""
+    return verdict.inside >= 0.93 and abs(verdict.median / consistency.CHI2_MEDIAN - 1) <= 0.1
 
 
 def one_scan(key: jax.Array, cell: Cell) -> dict[str, Sample]:
@@ -120,8 +138,8 @@ def fused_scans(runs: int) -> str:
         experiment = partial(many_scans, correlation=correlation, models=tuple(models.values()))
         results = [run(experiment, *c, runs) for c in tqdm(cells.items(), desc=f"a = {correlation}", disable=None)]
         for i, name in enumerate(models):
-            verdicts = [[judge(Sample(errors[:, i, k - 1], np.asarray(True))) for k in AFTER] for errors, _ in results]
-            nis = [np.asarray(x[:, i])[np.asarray(x[:, i]) > 0] for _, x in results]
+            verdicts = [[judge(_of(samples, i, k - 1)) for k in AFTER] for samples, _ in results]
+            nis = [x[:, i][x[:, i] > 0] for _, x in results]
             good = sum(consistency.holds(v, band) for of_cell in verdicts for v in of_cell)
             columns = [_range(of_cell[j].mean for of_cell in verdicts) for j in range(len(AFTER))]
             inside = _range((v.inside for of_cell in verdicts for v in of_cell), 3)
@@ -147,17 +165,19 @@ def many_scans(key: jax.Array, cell: Cell, *, correlation: float, models: tuple[
     return consistency.fused(key, cell.world, cell.path, cell.scanner, cell.cov_pose, correlation, models)
 
 
-def run(experiment: Callable[[jax.Array, Cell], Any], name: str, cell: Cell, runs: int) -> Any:
-    """An experiment, many times; the seed follows from the name of the cell."""
+def run(experiment: Callable[..., Any], name: str, cell: Any, runs: int) -> Any:
+    """An experiment, many times, on all devices; the seed follows from the name of the cell."""
     keys = jax.random.split(jax.random.key(zlib.crc32(name.encode())), runs)
-    return jax.tree.map(np.asarray, _map(keys, cell, experiment))
+    mesh = mesh_of_devices()
+    return run_batch(experiment, keys, cell, mesh=mesh, batch=BATCH, batches=-(-runs // (BATCH * mesh.size)))
 
 
-def _many(keys: jax.Array, cell: Cell, experiment: Callable[[jax.Array, Cell], Any]) -> Any:
-    return jax.lax.map(lambda key: experiment(key, cell), keys, batch_size=BATCH)
+def _of(samples: Sample, model: int, scan: int) -> Sample:
+    return jax.tree.map(lambda x: x[:, model, scan], samples)
 
 
-_map = jax.jit(_many, static_argnums=2)
+def _short(verdict: Verdict) -> str:
+    return f"mean {verdict.mean:.3f}, inside {verdict.inside:.4f} of {verdict.runs}"
 
 
 def _range(values: Iterable[float], digits: int = 2) -> str:

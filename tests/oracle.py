@@ -35,7 +35,7 @@ GAUSS_NEWTON_STEPS = 5
 RIM = 0.5
 FEWEST_CIRCLE_POINTS = 5
 # Points closer than this (sigmas) to the line beside their own may be that line's.
-CORNER_SIGMAS = 3.0
+UNSURE_SIGMAS = 3.0
 # A beam more grazing than this (cosine of the incidence) does not say where it meets a line.
 SHALLOW = 0.02
 # What a scan says of a pose error that persists is known to this part: it depends on the pose.
@@ -361,6 +361,17 @@ def sweep_of(
     )
 
 
+def _gap_gate(arc: float, thresholds: Any, sr: float) -> float:
+    """Criterion 1: the largest distance of successive points, m, by the arc between their beams."""
+    t = thresholds
+    return max(t.gap_distance, t.gap_spacings * arc, t.gap_sigmas * math.sqrt(2) * sr)
+
+
+def compact(of_beam: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """The slots of the core as they are numbered here, where no free one stands between others."""
+    return np.append(np.cumsum(valid) - 1, -1)[of_beam]
+
+
 def segment(sweep: Sweep, *, thresholds: Any, rules: Any, margin: Margin) -> tuple[list[list[int]], dict[str, int]]:
     """Cut the sweep into runs of points that may be lines, s4.3.1.
 
@@ -391,7 +402,7 @@ def segment(sweep: Sweep, *, thresholds: Any, rules: Any, margin: Margin) -> tup
 
         da = abs(bearing[i] - bearing[i - 1])
         gap = math.hypot(xs[i] - xs[i - 1], ys[i] - ys[i - 1])
-        if not margin.below(gap, max(t.gap_distance, t.gap_spacings * min(r[i], r[i - 1]) * da)):
+        if not margin.below(gap, _gap_gate(min(r[i], r[i - 1]) * da, t, sweep.sr)):
             broken_by = "gap"
         elif not margin.below(da, t.gap_beams * sweep.spacing):
             broken_by = "bearing"
@@ -555,11 +566,39 @@ def without_corners(sweep: Sweep, runs: list[list[int]], margin: Margin) -> list
             cos2 = (sweep.u[run] @ normal) ** 2
             sigma = np.sqrt(sweep.sr**2 * cos2 + (sweep.r[run] * sweep.sa) ** 2 * (1 - cos2))
             across = np.abs((sweep.o[run] - beside.centroid) @ normal)
-            own = [i for i in range(len(run)) if margin.below(CORNER_SIGMAS * float(sigma[i]), float(across[i]))]
+            own = [i for i in range(len(run)) if margin.below(UNSURE_SIGMAS * float(sigma[i]), float(across[i]))]
             beyond = (own[0] if side < 0 else len(run) - 1 - own[-1]) if own else len(run)
             if 3 * beyond <= len(run) and 2 * beyond <= len(run) - 3:
                 begin, end = (beyond, end) if side < 0 else (begin, len(run) - beyond)
         result.append(run[begin:end])
+    return result
+
+
+def without_sparse(
+    sweep: Sweep, runs: list[list[int]], kept: list[list[int]], thresholds: Any, margin: Margin
+) -> list[list[int]]:
+    """The points of each run that are surely near enough to their neighbours for criterion 1; none if hardly any is.
+
+    Args:
+      sweep: the valid beams.
+      runs: those that are lines, each a list of positions in the sweep.
+      kept: of each run the points that have not been left out before.
+      thresholds: of criterion 1.
+      margin: notes how clear the decisions were.
+    """
+    result = []
+    for run, mine in zip(runs, kept, strict=True):
+        angle = regression(sweep.o[run]).angle
+        normal = np.array([math.cos(angle), math.sin(angle)])
+        dense = []
+        for i in mine:
+            incidence = math.acos(min(max(abs(float(normal @ sweep.u[i])), 0.01), 1.0))
+            arc = float(sweep.r[i] * sweep.spacing)
+            noise = math.hypot(sweep.sr, sweep.r[i] * sweep.sa * math.tan(incidence))
+            farthest = arc / math.cos(incidence) + UNSURE_SIGMAS * math.sqrt(2) * noise
+            if margin.below(farthest, _gap_gate(arc, thresholds, sweep.sr)):
+                dense.append(i)
+        result.append(dense if len(dense) >= 3 and 3 * len(dense) >= len(run) else [])
     return result
 
 
@@ -899,13 +938,17 @@ def extract(
             status |= Status.SCAN_LINES_FULL
         else:
             in_line[run] = True
-            line_of_beam[sweep.beam[run]] = len(of_lines)
             of_lines.append(run)
     kept_points = without_corners(sweep, of_lines, margin) if rules.leave_out_corners else of_lines
-    found = [
-        _line_of_run(sweep, run, kept, covariance=covariance, rules=rules)
-        for run, kept in zip(of_lines, kept_points, strict=True)
-    ]
+    if rules.leave_out_sparse:
+        kept_points = without_sparse(sweep, of_lines, kept_points, thresholds, margin)
+    found = []
+    for run, points in zip(of_lines, kept_points, strict=True):
+        if points:
+            line_of_beam[sweep.beam[run]] = len(found)
+            found.append(_line_of_run(sweep, run, points, covariance=covariance, rules=rules))
+        else:
+            rejected["too_few"] += len(run)
     lines = Lines(
         anchor=_stack(found, "anchor", (2,)),
         offset=_stack(found, "offset", ()),

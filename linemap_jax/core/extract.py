@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from linemap_jax.core import circles as circles_
-from linemap_jax.core.lines import MIN_POINTS, length_of_run, measure_lines, without_corner_points
+from linemap_jax.core.lines import MIN_POINTS, choose_points, length_of_run, measure_lines
 from linemap_jax.core.runs import select_runs
 from linemap_jax.core.segmentation import incremental
 from linemap_jax.core.sensor import Points, points_from_scan
@@ -115,11 +115,10 @@ def extract_points(
     few = run.n < MIN_POINTS
     short = length_of_run(run, points.position) <= thresholds.min_length
     runs, lines_full = select_runs(run.n, ends & ~few & ~short, capacity.lines)
-    own = without_corner_points(points, runs, noise) if rules.leave_out_corners else runs
     lines, jac_line_pose, cov_measurement = measure_lines(
         points,
         pose,
-        own,
+        choose_points(points, runs, thresholds, noise, rules),
         noise,
         maximum_likelihood=rules.maximum_likelihood,
         covariance=covariance,
@@ -140,6 +139,8 @@ def extract_points(
 
     status = jnp.where(lines_full, int(Status.SCAN_LINES_FULL), 0)
     status |= jnp.where(circles_full, int(Status.SCAN_CIRCLES_FULL), 0)
+    in_run = runs.of_point >= 0
+    on_line = in_run & lines.valid[runs.of_point]
     in_cluster = clusters.of_point >= 0
     modelled = circles.valid[clusters.of_point]
     return Extraction(
@@ -147,14 +148,14 @@ def extract_points(
         circles=neutral_where_free(circles),
         jac_line_pose=jac_line_pose,
         cov_measurement=cov_measurement,
-        line_of_beam=points.per_beam(runs.of_point),
+        line_of_beam=points.per_beam(jnp.where(on_line, runs.of_point, -1)),
         circle_of_beam=points.per_beam(jnp.where(in_cluster & modelled, clusters.of_point, -1)),
         rejected=Rejected(
             invalid=jnp.sum(~points.valid, dtype=jnp.int32),
             gap=breaks[0],
             distance=breaks[1],
             bearing=breaks[2],
-            too_few=points_of(run.n, ends & few),
+            too_few=points_of(run.n, ends & few) + jnp.sum(in_run & ~on_line, dtype=jnp.int32),
             too_short=points_of(run.n, ends & ~few & short),
             lone=points_of(size, cluster_ends & lone),
             near_line=jnp.sum(in_cluster & ~modelled, dtype=jnp.int32),

@@ -18,16 +18,21 @@ from linemap_jax.core import likelihood
 from linemap_jax.core.frames import dot, perp, shift_matrix, wrap_angle
 from linemap_jax.core.propagation import product, propagate, quadratic, square_root, symmetric
 from linemap_jax.core.runs import Runs
-from linemap_jax.core.segmentation.incremental import Run
+from linemap_jax.core.segmentation.incremental import Run, gap_gate
 from linemap_jax.core.sensor import Points, cov_point
-from linemap_jax.core.settings import Covariance, Jacobians, SensorNoise
+from linemap_jax.core.settings import Covariance, Jacobians, Rules, SensorNoise, Thresholds
 from linemap_jax.core.slots import neutral_where_free
 from linemap_jax.core.state import Lines, Pose, pytree
 
 MIN_POINTS = 3
 """At least three points are necessary to define a line (s4.3.1)."""
-CORNER_SIGMAS = 3.0
-"""Points of a run that are closer than this to the line beside it may be that line's."""
+UNSURE_SIGMAS = 3.0
+"""Noise may have decided what is closer than this to a gate, or to the line beside its own."""
+LEAST_SHARE = 1 / 3
+"""Of the points of a run must be left for the fit. A line through few of them, chosen by the line through all, would
+err by far more than it says."""
+GRAZING = 0.01
+"""Least cosine of an incidence that is reckoned with."""
 
 
 @pytree
@@ -251,25 +256,55 @@ def line_extent(
     return jnp.stack([dot(tangent, position[i] - anchor) for i in (runs.first, runs.last)], -1)
 
 
-def without_corner_points(points: Points, runs: Runs, noise: SensorNoise) -> Runs:
-    """The runs without the points at their ends that may belong to the line beside them.
+def choose_points(points: Points, runs: Runs, thresholds: Thresholds, noise: SensorNoise, rules: Rules) -> Runs:
+    """The runs with the points that the fit should use, by `leave_out_corners` and `leave_out_sparse`.
 
-    Just past a corner, points of the next wall still pass criterion 2. At an end of a run, a point that lies within
-    `CORNER_SIGMAS` of the line next to it in the sweep is left out of the fit, with all points beyond it; unless these
-    are more than a third, as where two pieces of one wall follow each other, or too few would be left.
+    A choice that depends on the noise of the points it makes biases what is fitted to them. So it is made by where the
+    line of the run, and the lines beside it, say that the points are.
 
     Args:
       points: the points of the scan.
       runs: the runs that are lines, in the order of the sweep.
+      thresholds: criterion 1.
       noise: of the sensor.
+      rules: which points are left out.
+
+    Returns:
+      The runs; not valid where less than a third of the points, or fewer than three, are left.
     """
+    if not (rules.leave_out_corners or rules.leave_out_sparse):
+        return runs
     fit = regress(points.position, runs)
     length2 = jnp.maximum(dot(fit.direction, fit.direction), 1)
-    normal, middle = perp(fit.direction) / jnp.sqrt(length2)[:, None], fit.origin + fit.centroid
+    normal = perp(fit.direction) / jnp.sqrt(length2)[:, None]
+    kept = runs.of_point >= 0
+    if rules.leave_out_corners:
+        kept &= ~_at_corners(points, runs, normal, fit.origin + fit.centroid, fit.count, noise)
+    if rules.leave_out_sparse:
+        kept &= ~_sparse(points, runs.spread(normal), thresholds, noise)
+    count = runs.sum(kept.astype(fit.count.dtype))
+    valid = runs.valid & (count >= MIN_POINTS) & (count >= LEAST_SHARE * fit.count)
+    return dataclasses.replace(runs, of_point=jnp.where(kept, runs.of_point, -1), valid=valid)
+
+
+def _at_corners(
+    points: Points,
+    runs: Runs,
+    normal: Float[Array, "K 2"],
+    middle: Float[Array, "K 2"],
+    size: Float[Array, " K"],
+    noise: SensorNoise,
+) -> Bool[Array, " N"]:
+    """The points at the ends of the runs that may belong to the line beside them.
+
+    Just past a corner, points of the next wall still pass criterion 2. At an end of a run, a point that lies within
+    `UNSURE_SIGMAS` of the line next to it in the sweep is left out of the fit, with all points beyond it; unless these
+    are more than a third, as where two pieces of one wall follow each other, or too few would be left.
+    """
     index = jnp.arange(runs.of_point.shape[0])
     count = runs.valid.shape[0]
-    most = jnp.minimum(fit.count / 3, (fit.count - MIN_POINTS) / 2)
-    kept = runs.of_point >= 0
+    most = jnp.minimum(size / 3, (size - MIN_POINTS) / 2)
+    left_out = jnp.zeros(index.shape, bool)
     for side in (-1, 1):
         # The line beside each run, in front of its first point or behind its last one
         beside = jnp.clip(jnp.arange(count) + side, 0, count - 1)
@@ -278,14 +313,29 @@ def without_corner_points(points: Points, runs: Runs, noise: SensorNoise) -> Run
         across = dot(there[:, :2], points.position - there[:, 2:])
         along_beam = dot(there[:, :2], points.beam) ** 2
         variance = noise.range_sigma**2 * along_beam + (points.range * noise.bearing_sigma) ** 2 * (1 - along_beam)
-        far = across**2 > CORNER_SIGMAS**2 * variance
+        far = across**2 > UNSURE_SIGMAS**2 * variance
         # The outermost point that is surely the run's own
         mine = (runs.of_point[None] == jnp.arange(count)[:, None]) & far[None]
         outermost = jnp.max(jnp.where(mine, side * index[None], -index.shape[0]), -1)
         last = jnp.where(side > 0, runs.last, -runs.first)
         trims = exists & (last - outermost <= most)
-        kept = kept & ~(trims[runs.of_point] & (side * index > outermost[runs.of_point]))
-    return dataclasses.replace(runs, of_point=jnp.where(kept, runs.of_point, -1))
+        left_out |= trims[runs.of_point] & (side * index > outermost[runs.of_point])
+    return left_out
+
+
+def _sparse(
+    points: Points, normal: Float[Array, "N 2"], thresholds: Thresholds, noise: SensorNoise
+) -> Bool[Array, " N"]:
+    """The points that may be too far from their neighbours for criterion 1, by `UNSURE_SIGMAS` of that distance.
+
+    Where a beam meets the line at an incidence i, the next point is r spacing / cos(i) away. That distance errs by the
+    noise of two ranges, and by two bearings' noise, which moves where beams meet the line.
+    """
+    cosine2 = jnp.maximum(dot(normal, points.beam) ** 2, GRAZING**2)
+    arc = points.range * points.spacing
+    sway = (points.range * noise.bearing_sigma) ** 2 * (1 - cosine2) / cosine2
+    unsure = UNSURE_SIGMAS * jnp.sqrt(2 * (noise.range_sigma**2 + sway))
+    return arc / jnp.sqrt(cosine2) + unsure >= gap_gate(arc, thresholds, noise)
 
 
 def length_of_run(run: Run, position: Float[Array, "N 2"]) -> Float[Array, " N"]:

@@ -32,6 +32,8 @@ class Thresholds:
     gap_spacings: Number = 6.0
     """Criterion 1 widens to this multiple of the arc between the two beams; 6 holds walls down to a grazing angle of
     10 degrees together. `paper`: 0 (a fixed distance)."""
+    gap_sigmas: Number = 5.0
+    """Criterion 1 widens to this multiple of what noise of the range adds to that distance. `paper`: 0."""
     gap_beams: Number = 2.5
     """[alpha_crit] Criterion 3: largest angle between successive points, in beam spacings. `paper`: 1.5."""
     line_distance: Number = 0.03
@@ -150,6 +152,9 @@ class Rules:
     and is biased where a wall is seen at a slant."""
     leave_out_corners: bool = True
     """Points at the end of a run that may belong to the line beside it take no part in the fit."""
+    leave_out_sparse: bool = True
+    """Points so far apart that noise decides whether criterion 1 holds take no part in the fit: where a wall is seen at
+    a grazing angle, only those that noise has moved together would make up a line."""
     fit_circles: bool = True
     """Fit a circle to a cluster where there are points enough. Eqs. (18)-(20) describe the visible arc: a centre that
     lies before the pole's and moves with the viewpoint."""
@@ -174,6 +179,7 @@ class Rules:
 PAPER_THRESHOLDS = Thresholds(
     gap_distance=0.5,
     gap_spacings=0.0,
+    gap_sigmas=0.0,
     gap_beams=1.5,
     line_distance=0.05,
     line_sigmas=0.0,

@@ -199,7 +199,7 @@ class Rejected:
     gap: Int[Array, ""]  # broke a run by criterion 1, distance to the previous point
     distance: Int[Array, ""]  # broke a run by criterion 2, distance to the line
     bearing: Int[Array, ""]  # broke a run by criterion 3, angle to the previous point
-    too_few: Int[Array, ""]  # lie in runs of fewer than three points
+    too_few: Int[Array, ""]  # lie in runs of fewer than three points that can be used
     too_short: Int[Array, ""]  # lie in runs shorter than the shortest line
     lone: Int[Array, ""]  # in no line and in no cluster
     near_line: Int[Array, ""]  # lie in clusters too close to a line to be modelled

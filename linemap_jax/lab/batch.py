@@ -20,8 +20,8 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array
 
-Experiment = Callable[[Any], Any]
-"""From what one run differs by to what it gives; both are pytrees of arrays."""
+Experiment = Callable[..., Any]
+"""From what one run differs by, and what all have in common, to what it gives; all are pytrees of arrays."""
 
 AXIS = "runs"
 """The axis of a mesh over which runs are spread."""
@@ -47,7 +47,7 @@ def mesh_of_devices(count: int | None = None) -> Mesh:
 def run_chunks(
     experiment: Experiment,
     runs: Any,
-    *,
+    *common: Any,
     mesh: Mesh | None = None,
     batch: int = BATCH,
     batches: int = 1,
@@ -59,6 +59,7 @@ def run_chunks(
       experiment: what is done with each run. Compiled once for each function object: define it once, or use
         `functools.partial` with the same arguments.
       runs: what the runs differ by; stacked, each leaf with a leading axis `[R]`.
+      *common: what they have in common; further arguments of the experiment.
       mesh: the devices; one of the first device alone unless given.
       batch: runs that one device works on side by side.
       batches: how many such batches a device has in each chunk.
@@ -85,7 +86,7 @@ def run_chunks(
         # The last chunk is filled up with its last run, so that it fits the compiled program.
         index = np.minimum(np.arange(begin, begin + size), count - 1)
         chunk = jax.tree.map(partial(_spread, index=index, sharding=sharding), runs)
-        results = many(chunk)
+        results = many((chunk, common))
         if not _are_here(results):
             results = multihost_utils.process_allgather(results, tiled=True)
         yield begin, jax.tree.map(partial(_first, count=count - begin), results)
@@ -100,27 +101,30 @@ def _are_here(results: Any) -> bool:
     return all(x.is_fully_addressable for x in jax.tree.leaves(results))
 
 
-def run_batch(experiment: Experiment, runs: Any, **options: Any) -> Any:
+def run_batch(experiment: Experiment, runs: Any, *common: Any, **options: Any) -> Any:
     """The results of many runs at once, stacked `[R]` on the host.
 
     Args:
       experiment: what is done with each run.
       runs: what the runs differ by; stacked `[R]`.
+      *common: what they have in common.
       **options: of `run_chunks`.
     """
-    chunks = [chunk for _, chunk in run_chunks(experiment, runs, **options)]
+    chunks = [chunk for _, chunk in run_chunks(experiment, runs, *common, **options)]
     return jax.tree.map(lambda *x: np.concatenate(x), *chunks)
 
 
 @lru_cache(maxsize=64)
-def _many(experiment: Experiment, mesh: Mesh, batch: int) -> Callable[[Any], Any]:
+def _many(experiment: Experiment, mesh: Mesh, batch: int) -> Callable[..., Any]:
     """The compiled program for one chunk. Kept, since a new closure would be compiled anew."""
 
-    def on_one_device(runs: Any) -> Any:
-        return jax.lax.map(experiment, runs, batch_size=batch)
+    def on_one_device(given: tuple[Any, tuple[Any, ...]]) -> Any:
+        runs, common = given
+        return jax.lax.map(lambda run: experiment(run, *common), runs, batch_size=batch)
 
-    spec = PartitionSpec(AXIS)
-    return jax.jit(jax.shard_map(on_one_device, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False))
+    split, whole = PartitionSpec(AXIS), PartitionSpec()
+    specs = ((split, whole),)
+    return jax.jit(jax.shard_map(on_one_device, mesh=mesh, in_specs=specs, out_specs=split, check_vma=False))
 
 
 def _spread(leaf: Array, *, index: np.ndarray, sharding: NamedSharding) -> Array:

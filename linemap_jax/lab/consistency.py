@@ -29,7 +29,7 @@ from linemap_jax.core.frames import dot, unit, wrap_angle
 from linemap_jax.core.fusion import forget, fuse_lines
 from linemap_jax.core.lines import MIN_POINTS, measure_lines
 from linemap_jax.core.matching import compare_lines
-from linemap_jax.core.propagation import inverse, quadratic, square_root
+from linemap_jax.core.propagation import inverse, quadratic
 from linemap_jax.core.runs import Runs
 from linemap_jax.core.sensor import points_from_scan
 from linemap_jax.core.settings import (
@@ -45,13 +45,14 @@ from linemap_jax.core.settings import (
 from linemap_jax.core.state import Lines, Pose, Scan, empty_lines, pytree
 from linemap_jax.lab.generators import room
 from linemap_jax.lab.raycast import cast
+from linemap_jax.lab.robot import estimate_pose, estimate_poses
 from linemap_jax.lab.scanners import Scanner, noise_of, simulate_scan, sweep
 from linemap_jax.lab.world import Kind, World, polygon
 
-CHI2_95 = -2 * math.log(0.05)
-"""95 % quantile of chi-square with 2 degrees of freedom."""
+CHI2_95 = {2: -2 * math.log(0.05), 3: 7.814727903251179}
+"""95 % quantile of chi-square, by its degrees of freedom."""
 CHI2_MEDIAN = 2 * math.log(2)
-"""Its median."""
+"""Median of chi-square with 2 degrees of freedom."""
 SEEN_BEAMS = 10
 """Fewest nominal beams on a wall that an experiment may choose."""
 
@@ -89,6 +90,7 @@ class Sample(NamedTuple):
     """What one run has to say."""
 
     nees: Any
+    error: Any  # [n] the estimate less the truth, in axes of the experiment
     counts: Any  # false where nothing was found
 
 
@@ -123,9 +125,9 @@ def known_points(
     wall = jax.tree.map(lambda x: x[which], walls_of(world))
     on_wall = cast(world, pose[:2], unit(pose[2] + scanner.bearings)).thing == which
     scan = _scan_of_wall(of_scan, wall, on_wall, pose, scanner)
-    estimate = Pose(mean=pose + _normal(of_pose, cov_pose), cov=cov_pose)
+    estimate = estimate_pose(of_pose, pose, cov_pose)
     lines = {kind.value: _fit(scan, estimate, noise_of(scanner), kind) for kind in Fit}
-    return {name: Sample(nees(line_error(line, wall), line.cov), jnp.asarray(True)) for name, line in lines.items()}
+    return {name: _sample(line, wall, jnp.asarray(True)) for name, line in lines.items()}
 
 
 def pipeline(
@@ -151,17 +153,16 @@ def pipeline(
     of_wall, of_scan, of_pose = jax.random.split(key, 3)
     which, seen = _visible_wall(of_wall, world, pose, scanner)
     scan, truth = simulate_scan(of_scan, world, pose, scanner)
-    estimate = Pose(mean=pose + _normal(of_pose, cov_pose), cov=cov_pose)
-    found = extract(scan, estimate, noise=noise_of(scanner), **options)
+    found = extract(scan, estimate_pose(of_pose, pose, cov_pose), noise=noise_of(scanner), **options)
     lines, count = found.lines, seen.shape[0]
     beams = (found.line_of_beam[:, None] == jnp.arange(lines.valid.shape[0])[None]).astype(jnp.float32)
     met = (truth.thing[:, None] == jnp.arange(count)[None]).astype(jnp.float32)
     of_line = jnp.argmax(jnp.einsum("nl,nw->lw", beams, met), -1)
     wall = jax.tree.map(lambda x: x[of_line], walls_of(world))
-    errors = nees(line_error(lines, wall), lines.cov)
+    every = _sample(lines, wall, lines.valid)
     length = jnp.asarray(jnp.where(lines.valid & (of_line == which), lines.length, 0))
     longest = jnp.argmax(length)
-    return Sample(errors[longest], length[longest] > 0), Sample(errors, lines.valid)
+    return jax.tree.map(lambda x: x[longest], every)._replace(counts=length[longest] > 0), every
 
 
 class Model(NamedTuple):
@@ -179,7 +180,7 @@ def fused(
     cov_pose: Float[Array, "3 3"],
     correlation: Number,
     models: Sequence[Model],
-) -> tuple[Float[Array, "M T"], Float[Array, "M T"]]:
+) -> tuple[Sample, Float[Array, "M T"]]:
     """The NEES of one wall in the map after each scan, and the NIS of each scan's line before it is fused.
 
     The fit is that of `known_points`; it is known which line is which.
@@ -190,38 +191,34 @@ def fused(
       path: the true poses.
       scanner: its noise is what the fit believes.
       cov_pose: of the pose's error.
-      correlation: of the pose's error from one scan to the next, e[k+1] = a e[k] + sqrt(1 - a^2) w; 0 for errors that
-        are independent, 1 for one that stays.
+      correlation: of the pose's error from one scan to the next; see `robot.pose_errors`.
       models: what `M` maps believe of that.
 
     Returns:
-      NEES, and NIS, which is zero where there is none: for the first scan, and where the wall is out of sight.
+      Samples, `[M, T]`; and NIS, which is zero where there is none: for the first scan, and where the wall is out of
+      sight.
     """
-    of_wall, of_start, of_scans, of_drift = jax.random.split(key, 4)
+    of_wall, of_scans, of_poses = jax.random.split(key, 3)
     which, _ = _visible_wall(of_wall, world, path[0], scanner)
     wall = jax.tree.map(lambda x: x[which], walls_of(world))
 
-    def step(
-        carry: tuple[Array, list[Lines]], x: tuple[Array, Array, Array, Array]
-    ) -> tuple[tuple[Array, list[Lines]], tuple[Array, Array]]:
-        error, held = carry
-        pose, of_scan, of_drift, is_first = x
+    def step(held: list[Lines], x: tuple[Array, Array, Pose, Array]) -> tuple[list[Lines], tuple[list[Sample], Array]]:
+        of_scan, pose, estimate, is_first = x
         on_wall = cast(world, pose[:2], unit(pose[2] + scanner.bearings)).thing == which
         scan = _scan_of_wall(of_scan, wall, on_wall, pose, scanner)
-        line = _fit(scan, Pose(mean=pose + error, cov=cov_pose), noise_of(scanner), Fit.DEFAULT)
+        line = _fit(scan, estimate, noise_of(scanner), Fit.DEFAULT)
         seen = jnp.sum(on_wall) >= MIN_POINTS
         improved = [_improve(line, before, ~is_first, seen, model) for before, model in zip(held, models, strict=True)]
         held = [after for after, _ in improved]
-        errors = [nees(line_error(after, wall), after.cov) for after in held]
-        error = correlation * error + jnp.sqrt(1 - correlation**2) * _normal(of_drift, cov_pose)
-        return (error, held), (jnp.stack(errors), jnp.stack([nis for _, nis in improved]))
+        samples = [_sample(after, wall, jnp.asarray(True)) for after in held]
+        return held, (samples, jnp.stack([nis for _, nis in improved]))
 
     count = path.shape[0]
-    of_scans, of_drift = jax.random.split(of_scans, count), jax.random.split(of_drift, count)
+    estimates = estimate_poses(of_poses, path, cov_pose, correlation=correlation)
     nothing = jax.tree.map(lambda x: x[0], empty_lines(1, path.dtype))
-    start = (_normal(of_start, cov_pose), [nothing for _ in models])
-    _, (errors, nis) = jax.lax.scan(step, start, (path, of_scans, of_drift, jnp.arange(count) == 0))
-    return errors.T, nis.T
+    scans = (jax.random.split(of_scans, count), path, estimates, jnp.arange(count) == 0)
+    _, (samples, nis) = jax.lax.scan(step, [nothing for _ in models], scans)
+    return jax.tree.map(lambda *x: jnp.stack(x), *samples), nis.T
 
 
 def _improve(
@@ -298,8 +295,10 @@ def _fit(scan: Scan, pose: Pose, noise: SensorNoise, kind: Fit) -> Lines:
     return jax.tree.map(lambda x: x[0], lines)
 
 
-def _normal(key: Array, cov: Float[Array, "3 3"]) -> Float[Array, "3"]:
-    return square_root(cov) @ jax.random.normal(key, (3,), cov.dtype)
+def _sample(lines: Lines, wall: Walls, counts: Bool[Array, "*s"]) -> Sample:
+    """The errors of lines."""
+    error = line_error(lines, wall)
+    return Sample(nees(error, lines.cov), error, counts)
 
 
 @pytree
@@ -356,23 +355,35 @@ class Verdict(NamedTuple):
     """What many runs say of one configuration."""
 
     runs: int
+    found: float  # share of runs in which there was something to judge
     mean: float
     median: float
-    inside: float  # share of runs inside the 95 % ellipse
+    inside: float  # share inside the 95 % ellipse
+    bias: tuple[float, ...]  # mean of each number's error over its spread
 
 
 def judge(sample: Sample) -> Verdict:
-    """Mean and median of the NEES of two numbers, and the share of runs inside the 95 % ellipse.
+    """Mean and median of the NEES, the share of estimates inside the 95 % ellipse, and the bias in sigmas.
+
+    Args:
+      sample: stacked, of two numbers (lines) or three (circles).
 
     Raises:
-      ValueError: if there is no run that counts.
+      ValueError: if there are fewer than two runs that count.
     """
-    values = np.asarray(sample.nees)
-    values = values[np.broadcast_to(np.asarray(sample.counts), values.shape)]
-    if not values.size:
-        raise ValueError("no run has found a line")
-    inside = float(np.mean(values < CHI2_95))
-    return Verdict(values.size, float(np.mean(values)), float(np.median(values)), inside)
+    values, error = np.asarray(sample.nees), np.asarray(sample.error)
+    counts = np.broadcast_to(np.asarray(sample.counts), values.shape)
+    values, error = values[counts], error[counts]
+    if len(values) < 2:
+        raise ValueError("hardly a run has found anything")
+    return Verdict(
+        runs=len(values),
+        found=float(np.mean(counts)),
+        mean=float(np.mean(values)),
+        median=float(np.median(values)),
+        inside=float(np.mean(values < CHI2_95[error.shape[-1]])),
+        bias=tuple((np.mean(error, 0) / np.std(error, 0)).tolist()),
+    )
 
 
 class Bands(NamedTuple):

@@ -1,4 +1,4 @@
-"""Whether the covariances of circles can be believed; as `consistency` asks of lines.
+"""Whether the covariances of circles can be believed; as `consistency` asks of lines, and judged by its `judge`.
 
 Of a fitted circle the truth is the pole, of a circle after Eqs. (18)-(20) the one that the same beams would give
 without noise. The NEES of (x, y, radius) is chi-square with 3 degrees of freedom where the covariance is right. Each
@@ -11,11 +11,10 @@ experiment is a function of a key that makes one run; map it over keys:
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from linemap_jax.core.circles import measure_circles
@@ -23,30 +22,20 @@ from linemap_jax.core.extract import extract
 from linemap_jax.core.frames import dot, perp
 from linemap_jax.core.fusion import forget, fuse_circles
 from linemap_jax.core.matching import match_circles
-from linemap_jax.core.propagation import square_root
 from linemap_jax.core.runs import Runs
 from linemap_jax.core.sensor import points_from_scan
 from linemap_jax.core.settings import Mount, Number, Rules, Thresholds, persistence_of
 from linemap_jax.core.slots import choose
 from linemap_jax.core.state import Circles, Pose, Scan, empty_circles
-from linemap_jax.lab.consistency import Model, nees
+from linemap_jax.lab.consistency import Model, Sample, nees
+from linemap_jax.lab.robot import estimate_pose, estimate_poses
 from linemap_jax.lab.scanners import Scanner, Truth, noise_of, simulate_scan
 from linemap_jax.lab.world import poles
 
-CHI2_95 = 7.814727903251179
-"""95 % quantile of chi-square with 3 degrees of freedom."""
 ARC_POINTS = 6
 """Fewest points of an arc whose covariance is said to hold."""
 ARC_SIGMAS = 3.0
 """Least spread of such an arc, in sigmas of the range: a smaller radius is made of noise."""
-
-
-class Sample(NamedTuple):
-    """What one run has to say."""
-
-    nees: Array
-    error: Array  # [3] m: away from the scanner, to the left, of the radius
-    counts: Array  # false where nothing was found
 
 
 def known_points(
@@ -136,7 +125,7 @@ def fused(
     Returns:
       Samples, `[M, T]`, that count from the first fit on; and NIS, which is zero where there is none.
     """
-    of_start, of_scans, of_drift = jax.random.split(key, 3)
+    of_scans, of_poses = jax.random.split(key)
     open_gates = Thresholds(circle_match_distance=jnp.inf, circle_match_nis=jnp.inf)
 
     def improve(new: Circles, before: Circles, model: Model) -> tuple[Circles, Array]:
@@ -147,23 +136,20 @@ def fused(
         after = fuse_circles(before, new, match, Rules(), model.pose_error)
         return choose(before.valid, after, choose(new.valid, new, before)), match.nis[0]
 
-    def step(carry: tuple[Array, list[Circles]], x: tuple[Array, Array, Array]) -> tuple[Any, Any]:
-        error, held = carry
-        pose, of_scan, of_drift = x
+    def step(held: list[Circles], x: tuple[Array, Array, Pose]) -> tuple[list[Circles], tuple[list[Sample], Array]]:
+        of_scan, pose, estimate = x
         scan, _ = simulate_scan(of_scan, poles(center[None], radius), pose, scanner)
-        new = _measure(scan, Pose(mean=pose + error, cov=cov_pose), scanner, fit=True)
+        new = _measure(scan, estimate, scanner, fit=True)
         new = jax.tree.map(lambda x: x[None], new)
         new = choose(new.fitted, new, empty_circles(1, path.dtype))
         improved = [improve(new, before, model) for before, model in zip(held, models, strict=True)]
         held = [after for after, _ in improved]
         samples = [_sample(jax.tree.map(lambda x: x[0], x), center, radius, pose, x.valid[0]) for x in held]
-        error = correlation * error + jnp.sqrt(1 - correlation**2) * _normal(of_drift, cov_pose)
-        return (error, held), (samples, jnp.stack([nis for _, nis in improved]))
+        return held, (samples, jnp.stack([nis for _, nis in improved]))
 
-    count = path.shape[0]
-    start = (_normal(of_start, cov_pose), [empty_circles(1, path.dtype) for _ in models])
-    keys = (jax.random.split(of_scans, count), jax.random.split(of_drift, count))
-    _, (samples, nis) = jax.lax.scan(step, start, (path, *keys))
+    estimates = estimate_poses(of_poses, path, cov_pose, correlation=correlation)
+    scans = (jax.random.split(of_scans, path.shape[0]), path, estimates)
+    _, (samples, nis) = jax.lax.scan(step, [empty_circles(1, path.dtype) for _ in models], scans)
     return jax.tree.map(lambda *x: jnp.stack(x), *samples), nis.T
 
 
@@ -180,7 +166,7 @@ def _look(
     spacing = scanner.bearings[1] - scanner.bearings[0]
     pose = pose.at[2].add(spacing * (jax.random.uniform(of_turn, dtype=pose.dtype) - 0.5))
     scan, truth = simulate_scan(of_scan, poles(center[None], radius), pose, scanner)
-    return scan, truth, pose, Pose(mean=pose + _normal(of_pose, cov_pose), cov=cov_pose)
+    return scan, truth, pose, estimate_pose(of_pose, pose, cov_pose)
 
 
 def _measure(scan: Scan, pose: Pose, scanner: Scanner, *, fit: bool) -> Circles:
@@ -201,38 +187,9 @@ def _measure(scan: Scan, pose: Pose, scanner: Scanner, *, fit: bool) -> Circles:
 def _sample(
     circle: Circles, center: Float[Array, "2"], radius: Float[Array, ""], pose: Float[Array, "3"], counts: Array
 ) -> Sample:
-    """The error of one circle."""
+    """The error of one circle: away from the scanner, to the left, of the radius. m."""
     step = circle.center - center
     error = jnp.concatenate([step, (circle.radius - radius)[None]])
     away = (center - pose[:2]) / jnp.sqrt(dot(center - pose[:2], center - pose[:2]))
     local = jnp.stack([dot(away, step), dot(perp(away), step), error[2]])
     return Sample(nees(error, circle.cov), local, counts)
-
-
-def _normal(key: Array, cov: Float[Array, "3 3"]) -> Float[Array, "3"]:
-    return square_root(cov) @ jax.random.normal(key, (3,), cov.dtype)
-
-
-class Verdict(NamedTuple):
-    """What many runs say of one configuration."""
-
-    runs: int
-    found: float  # share of runs in which there was a circle
-    mean: float
-    inside: float  # share of circles inside the 95 % ellipsoid
-    bias: tuple[float, float, float]  # mean error over its spread: away from the scanner, to the left, of the radius
-
-
-def judge(sample: Sample) -> Verdict:
-    """Mean of the NEES of three numbers, the share of circles inside the 95 % ellipsoid, and the bias in sigmas.
-
-    Raises:
-      ValueError: if there are fewer than two runs that count.
-    """
-    counts = np.asarray(sample.counts)
-    values, error = np.asarray(sample.nees)[counts], np.asarray(sample.error)[counts]
-    if values.size < 2:
-        raise ValueError("hardly a run has found a circle")
-    away, left, radius = (np.mean(error, 0) / np.std(error, 0)).tolist()
-    inside = float(np.mean(values < CHI2_95))
-    return Verdict(int(values.size), float(np.mean(counts)), float(np.mean(values)), inside, (away, left, radius))

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from linemap_jax.core.frames import unit, wrap_angle
+from linemap_jax.core.propagation import square_root
 from linemap_jax.core.settings import Number
 from linemap_jax.core.state import Pose, pytree
 
@@ -194,8 +195,7 @@ def pose_errors(key: Array, cov: Float[Array, "3 3"], *, count: int, correlation
     Returns:
       Errors of x, y, theta in the axes of the world. m, m, rad. Shape `[count, 3]`.
     """
-    values, vectors = jnp.linalg.eigh(cov)
-    root = vectors * jnp.sqrt(jnp.maximum(values, 0))[None]
+    root = square_root(cov)
     new = jax.random.normal(key, (count, 3), cov.dtype)
     a = jnp.asarray(correlation, cov.dtype)
 
@@ -205,6 +205,11 @@ def pose_errors(key: Array, cov: Float[Array, "3 3"], *, count: int, correlation
 
     _, later = jax.lax.scan(step, new[0], new[1:])
     return jnp.sum(jnp.concatenate([new[:1], later])[:, None] * root[None], -1)
+
+
+def estimate_pose(key: Array, pose: Float[Array, "3"], cov: Float[Array, "3 3"]) -> Pose:
+    """What the robot believes of one pose; as `estimate_poses`."""
+    return jax.tree.map(lambda x: x[0], estimate_poses(key, pose[None], cov))
 
 
 def estimate_poses(

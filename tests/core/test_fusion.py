@@ -343,10 +343,10 @@ def test_equal_views_are_averaged_and_what_they_may_share_stays() -> None:
     model = dataclasses.replace(one, offset=jnp.asarray(offsets[:1]))
     for n, offset in enumerate(offsets[1:], 2):
         model = fuse(model, dataclasses.replace(one, offset=jnp.asarray([offset])), YES)
-        np.testing.assert_allclose(model.offset[0], offsets[:n].mean(), atol=1e-8)
-        np.testing.assert_allclose(model.cov_independent[0], C_L / n, rtol=1e-6)
+        np.testing.assert_allclose(model.offset[0], offsets[:n].mean(), atol=1e-14)
+        np.testing.assert_allclose(model.cov_independent[0], C_L / n, rtol=1e-9)
         root = np.asarray(model.sqrt_persistent[0])
-        np.testing.assert_allclose(root @ root.T, PERSISTING @ PERSISTING.T, rtol=1e-6)
+        np.testing.assert_allclose(root @ root.T, PERSISTING @ PERSISTING.T, rtol=1e-9)
     assert model.times_detected[0] == 20
 
 

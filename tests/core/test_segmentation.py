@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from linemap_jax import Capacity, Extraction, Rules, Thresholds, extract, preset
+from linemap_jax import Capacity, Extraction, Rules, SensorNoise, Thresholds, extract, preset
 from linemap_jax.core.extract import as_dtype, with_defaults
 from linemap_jax.core.segmentation import incremental
 from linemap_jax.core.sensor import points_from_scan
@@ -26,9 +26,11 @@ EXACT = Thresholds(line_distance=1e-3, line_sigmas=0.0, min_length=0.1)
 """Criterion 2 without noise: the first point off the line breaks."""
 
 
-def extracted(ranges: np.ndarray, thresholds: Thresholds | None = None, **rules: bool) -> Extraction:
+def extracted(
+    ranges: np.ndarray, thresholds: Thresholds | None = None, noise: SensorNoise | None = None, **rules: bool
+) -> Extraction:
     scan = Scan.from_ranges(ranges, BEARINGS)
-    return extract(scan, HERE, thresholds=thresholds or Thresholds(), capacity=CAPACITY, rules=Rules(**rules))
+    return extract(scan, HERE, thresholds=thresholds, noise=noise, capacity=CAPACITY, rules=Rules(**rules))
 
 
 def counts(found: Extraction) -> dict[str, int]:
@@ -64,7 +66,7 @@ def test_criterion_1_breaks_at_a_step() -> None:
 def test_criterion_1_is_a_distance(gap: float, broken: bool) -> None:
     # Successive points are 2 (tan(a + 1 deg) - tan(a)) apart: 3.49 cm ahead of the robot.
     ranges = np.where(np.abs(np.arange(N) - 20) < 4, WALL, np.nan)
-    found = extracted(ranges, Thresholds(gap_distance=gap, gap_spacings=0.0))
+    found = extracted(ranges, Thresholds(gap_distance=gap, gap_spacings=0.0, gap_sigmas=0.0))
     assert counts(found).get("gap", 0) == (6 if broken else 0)
 
 
@@ -80,8 +82,38 @@ def test_criterion_1_widens_with_the_arc() -> None:
     assert np.sum(steps >= 0.15) > np.sum(steps >= np.maximum(0.15, 6 * arcs))
 
 
+def test_criterion_1_widens_with_the_noise() -> None:
+    ranges = np.where(np.arange(N) < 20, WALL, WALL + 0.2)
+    for sigma, broken in ((0.02, True), (0.03, False)):  # 5 sqrt(2) sigma: 14 cm, 21 cm
+        found = extracted(ranges, Thresholds(gap_spacings=0.0, line_distance=1.0), noise=SensorNoise(range_sigma=sigma))
+        assert counts(found).get("gap", 0) == broken
+
+
+def receding(shift: np.ndarray) -> np.ndarray:
+    """A wall that the last beams graze, with some points moved along their beams."""
+    return 0.4 / np.sin(np.radians(11) + BEARINGS[-1] - BEARINGS) + shift
+
+
+def test_points_that_noise_may_have_parted_take_no_part_in_the_fit() -> None:
+    last = np.arange(N) == N - 1
+    for rule in (True, False):
+        clean, moved = (extracted(receding(0.02 * last * on), leave_out_sparse=rule) for on in (0, 1))
+        assert beams(clean, 0) == beams(moved, 0) == list(range(N))  # of the run they are
+        assert (clean.lines.angle[0] == moved.lines.angle[0]) == rule
+
+
+def test_a_run_of_such_points_is_no_line() -> None:
+    ranges = np.where(np.arange(N) < N - 5, np.nan, receding(np.zeros(N)))
+    assert beams(extracted(ranges, leave_out_sparse=False), 0) == list(range(N - 5, N))
+    found = extracted(ranges)
+    assert not found.lines.valid.any()
+    assert np.all(found.line_of_beam == -1)
+    assert not found.circles.valid.any()
+    assert counts(found) == {"invalid": N - 5, "too_few": 5}
+
+
 def test_criterion_2_breaks_at_a_corner_and_gives_the_corner_back() -> None:
-    found = extracted(corner(30), EXACT)
+    found = extracted(corner(30), EXACT, leave_out_sparse=False)
     assert (beams(found, 0), beams(found, 1)) == (list(range(30)), list(range(30, N)))
     assert counts(found) == {"distance": 1}
     np.testing.assert_allclose(found.lines.begin[1], found.lines.end[0], atol=0.05)
@@ -89,7 +121,7 @@ def test_criterion_2_breaks_at_a_corner_and_gives_the_corner_back() -> None:
 
 
 def test_criterion_2_without_giving_back() -> None:
-    found = extracted(corner(30), EXACT, give_back_point=False)
+    found = extracted(corner(30), EXACT, give_back_point=False, leave_out_sparse=False)
     assert (beams(found, 0), beams(found, 1)) == (list(range(31)), list(range(31, N)))
     assert counts(found) == {"distance": 1}
 

@@ -5,6 +5,7 @@ is near the previous one. The running sums of Eq. (5) start anew at each run's f
 they lose everything in float32.
 """
 
+import math
 from typing import NamedTuple
 
 import jax
@@ -51,7 +52,7 @@ def segment(
     Args:
       points: the points of the scan.
       thresholds: criteria 1 to 3.
-      noise: what criterion 2 is scaled by.
+      noise: what criteria 1 and 2 are scaled by.
       rules: `give_back_point`.
 
     Returns:
@@ -63,7 +64,7 @@ def segment(
     range_before = jnp.concatenate([points.range[:1], points.range[:-1]])
     step = points.position - before
     arc = jnp.minimum(points.range, range_before) * points.turn
-    near = dot(step, step) < jnp.maximum(thresholds.gap_distance, thresholds.gap_spacings * arc) ** 2
+    near = dot(step, step) < gap_gate(arc, thresholds, noise) ** 2
     adjacent = points.turn < thresholds.gap_beams * points.spacing
     other = jnp.arange(points.valid.shape[0]) > 0
     follows = near & adjacent & other & points.valid
@@ -102,6 +103,12 @@ def segment(
     counts = [breaks & ~near, by_distance, breaks & near & ~adjacent]
     counts = jnp.stack([jnp.sum(count, dtype=jnp.int32) for count in counts])
     return ends, run, counts
+
+
+def gap_gate(arc: Float[Array, "*s"], thresholds: Thresholds, noise: SensorNoise) -> Float[Array, "*s"]:
+    """Criterion 1: the largest distance between successive points, in metres, by the arc between their beams."""
+    noisy = thresholds.gap_sigmas * math.sqrt(2) * noise.range_sigma
+    return jnp.maximum(jnp.maximum(thresholds.gap_distance, thresholds.gap_spacings * arc), noisy)
 
 
 def _before(which: Bool[Array, " N"]) -> Bool[Array, " N"]:
