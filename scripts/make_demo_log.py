@@ -8,8 +8,6 @@ The log is the same at every run, but for the last byte of rounding between mach
 """
 
 import argparse
-import gzip
-import io
 import sys
 from pathlib import Path
 
@@ -17,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from linemap_jax.io.carmen_writer import write_carmen
 from linemap_jax.lab.check import check
 from linemap_jax.lab.generators import laboratory
 from linemap_jax.lab.robot import Odometry, dead_reckoning
@@ -28,7 +27,7 @@ LOG = Path(__file__).resolve().parents[1] / "linemap_jax" / "io" / "data" / "dem
 SEED = 1996
 SCANS = 300
 SCAN_SECONDS = 0.6  # the paper's scanner needs about 600 ms for a scan
-NO_RETURN = 81.91  # m, what such scanners report
+RANGE_MAX = 50.0  # m
 POSE_SIGMA = (0.01, 0.01, 0.00175)  # m, m, rad (0.1 degrees); independent from scan to scan
 
 
@@ -42,8 +41,9 @@ def simulated() -> Simulation:
             bearings=sweep(-np.pi / 2, np.pi / 2, 361),
             range_sigma=0.015,
             bearing_sigma=0.0005,
+            step=0.01,
             dropout=0.003,
-            range_max=50.0,
+            range_max=RANGE_MAX,
         ),
         count=SCANS,
         cov_pose=jnp.diag(jnp.array(POSE_SIGMA)) ** 2,
@@ -51,36 +51,6 @@ def simulated() -> Simulation:
     )
     check(world, log.true_poses, clearance=0.3)
     return log
-
-
-def carmen_log(log: Simulation) -> str:
-    """The scans as the text of a CARMEN log."""
-    lines = [
-        "# message formats defined: PARAM FLASER",
-        "# PARAM param_name param_value",
-        "# FLASER num_readings [range_readings] x y theta odom_x odom_y odom_theta",
-        "# simulated: a laboratory of 18 m x 12 m with a corridor; poses of the laser, sigma 1 cm and 0.1 degrees",
-        "PARAM robot_use_laser on nohost 0",
-        "PARAM robot_frontlaser_offset 0.0 nohost 0",
-        "PARAM robot_rearlaser_offset 0.0 nohost 0",
-        "PARAM laser_front_laser_resolution 0.5 nohost 0",
-    ]
-    ranges = np.where(log.scans.valid, log.scans.ranges, NO_RETURN)
-    odometry = np.asarray(dead_reckoning(log.true_poses[0], log.odometry))
-    for i, (scan, pose, odom) in enumerate(zip(ranges, np.asarray(log.poses.mean), odometry, strict=True)):
-        readings = " ".join(f"{r:.2f}" for r in scan)
-        stamp = f"{i * SCAN_SECONDS:.3f}"
-        place = " ".join(f"{x:.4f} {y:.4f} {theta:.5f}" for x, y, theta in (pose, odom))
-        lines.append(f"FLASER {len(scan)} {readings} {place} {stamp} nohost {stamp}")
-    return "\n".join(lines) + "\n"
-
-
-def packed(text: str) -> bytes:
-    """The text under gzip, without a time or a name in the header, so that the bytes depend on the text alone."""
-    out = io.BytesIO()
-    with gzip.GzipFile(filename="", mode="wb", compresslevel=9, fileobj=out, mtime=0) as file:
-        file.write(text.encode("ascii"))
-    return out.getvalue()
 
 
 def main() -> None:
@@ -91,12 +61,21 @@ def main() -> None:
 
     jax.config.update("jax_enable_x64", True)
     log = simulated()
-    data = packed(carmen_log(log))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(data)
-    metres = np.hypot(*np.diff(np.asarray(log.true_poses)[:, :2], axis=0).T).sum()
     count, beams = log.scans.ranges.shape
-    sys.stdout.write(f"{path}: {count} scans of {beams} beams along {metres:.0f} m, {len(data) / 1000:.0f} kB\n")
+    write_carmen(
+        path,
+        ranges=np.where(log.scans.valid, log.scans.ranges, np.nan),
+        bearings=log.scans.bearings[0],
+        range_max=RANGE_MAX,
+        poses=log.poses.mean,
+        odometry=dead_reckoning(log.true_poses[0], log.odometry),
+        timestamps=SCAN_SECONDS * np.arange(count),
+        comments=["simulated: a laboratory of 18 m x 12 m with a corridor; poses with sigma 1 cm and 0.1 degrees"],
+        overwrite=True,
+    )
+    metres = np.hypot(*np.diff(np.asarray(log.true_poses)[:, :2], axis=0).T).sum()
+    size = path.stat().st_size / 1000
+    sys.stdout.write(f"{path}: {count} scans of {beams} beams along {metres:.0f} m, {size:.0f} kB\n")
 
 
 if __name__ == "__main__":

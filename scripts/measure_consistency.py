@@ -8,6 +8,8 @@ cell. With --write the tables go into README, between the markers.
 """
 
 import argparse
+import itertools
+import math
 import sys
 import time
 import zlib
@@ -17,14 +19,16 @@ from pathlib import Path
 from typing import Any, Literal
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
 from linemap_jax import preset
 from linemap_jax.core.settings import Persistence
-from linemap_jax.lab import consistency
+from linemap_jax.lab import consistency, consistency_of_circles
 from linemap_jax.lab.batch import mesh_of_devices, run_batch
 from linemap_jax.lab.consistency import Cell, Fit, Model, Sample, Verdict, judge
+from linemap_jax.lab.scanners import Scanner, sweep
 
 README = Path(__file__).resolve().parents[1] / "README.md"
 BEGIN, END = "<!-- consistency:begin -->", "<!-- consistency:end -->"
@@ -51,6 +55,7 @@ def main() -> int:
     for measure, runs in (
         (single_scans, options.runs),
         (fused_scans, options.fused_runs),
+        (poles, options.fused_runs),
     ):
         tables.append(measure(runs))
         print(tables[-1], flush=True)
@@ -163,6 +168,73 @@ def fused_scans(runs: int) -> str:
 def many_scans(key: jax.Array, cell: Cell, *, correlation: float, models: tuple[Model, ...]) -> Any:
     """NEES and NIS of fifty scans."""
     return consistency.fused(key, cell.world, cell.path, cell.scanner, cell.cov_pose, correlation, models)
+
+
+def poles(runs: int) -> str:
+    """Circles: known returns, what the pipeline finds, and twenty scans."""
+    cells = poles_of_table()
+    pipeline = partial(consistency_of_circles.pipeline, jacobians="analytic", **preset("default"))
+    experiments = {
+        name: partial(on_pole, experiment=experiment)
+        for name, experiment in (("known", consistency_of_circles.known_points), ("pipeline", pipeline))
+    }
+    verdicts: dict[str, list[Verdict]] = {"fit": [], "arc": [], "pipeline": []}
+    for name, cell in tqdm(cells.items(), desc="poles", disable=None):
+        for what, experiment in experiments.items():
+            found = run(experiment, name, cell, runs)
+            for kind, sample in found.items() if what == "known" else [("pipeline", found)]:
+                if np.mean(sample.counts) < 0.5:  # few are believed, and those are not a fair sample
+                    continue
+                verdict = judge(sample)
+                verdicts[kind].append(verdict)
+                band = consistency.bands(verdict.runs, len(cells), dof=3)
+                if not consistency.holds(verdict, band):
+                    print(f"out of band: {kind}: {name}: {_short(verdict)}", file=sys.stderr)
+    titles = {
+        "fit": "known returns, the most likely circle",
+        "arc": "known returns, Eqs. (18)-(20)",
+        "pipeline": "`default`, the circle nearest to the pole",
+    }
+    lines = [
+        f"{len(cells)} poles of 5, 10 and 20 cm radius at 2 and 5 m, {runs} runs each; the NEES of (x, y, radius), "
+        "whose mean is 3 where a covariance holds. Counted are cells in which at least half of the runs give a circle.",
+        "",
+        "| one pole | cells | mean NEES, least to largest | inside 95 % | bias of the radius, sigmas | cells in band |",
+        "| --- | ---: | --- | --- | --- | ---: |",
+    ]
+    for kind, title in titles.items():
+        of_cells = verdicts[kind]
+        inside = [consistency.holds(v, consistency.bands(v.runs, len(cells), dof=3)) for v in of_cells]
+        lines.append(
+            f"| {title} | {len(of_cells)} | {_range(v.mean for v in of_cells)} | "
+            f"{_range((v.inside for v in of_cells), 3)} | {_range(v.bias[2] for v in of_cells)} | "
+            f"{sum(inside)} of {len(of_cells)} |"
+        )
+    return "\n".join(lines)
+
+
+def on_pole(key: jax.Array, cell: Any, *, experiment: Callable[..., Any]) -> Any:
+    """One run with a pole."""
+    return experiment(key, *cell)
+
+
+def poles_of_table() -> dict[str, Any]:
+    """Poles by name: centre, radius, pose, scanner, covariance of the pose."""
+    cells = {}
+    for distance, radius, sigma, degrees, uncertain in itertools.product(
+        (2, 5), (0.05, 0.1, 0.2), (0.01, 0.03), (0.0, 0.1), (False, True)
+    ):
+        name = (
+            f"pole of {radius} m at {distance} m; {sigma} m, {degrees} degree; {'5 cm, 1 degree' if uncertain else '-'}"
+        )
+        scanner = Scanner(
+            bearings=sweep(-math.pi / 2, math.pi / 2, 361),
+            range_sigma=jnp.asarray(sigma),
+            bearing_sigma=jnp.asarray(math.radians(degrees)),
+        )
+        cov_pose = uncertain * jnp.diag(jnp.array([0.05, 0.05, math.radians(1)])) ** 2
+        cells[name] = (jnp.array([distance, 0.4]), jnp.asarray(radius), jnp.zeros(3), scanner, cov_pose)
+    return cells
 
 
 def run(experiment: Callable[..., Any], name: str, cell: Any, runs: int) -> Any:
