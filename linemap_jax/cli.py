@@ -17,6 +17,7 @@ import tyro
 
 if TYPE_CHECKING:
     from jax import Array
+    from jax.sharding import Mesh
 
     from linemap_jax.core.state import LineMap, Report
     from linemap_jax.io.log import Log
@@ -160,6 +161,40 @@ class Evaluate:
     """Print the scores as JSON."""
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Trials:
+    """Simulate, map and score many drives, each in a world of its own; a run that was stopped goes on."""
+
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="DIR")]
+    """Folder for the results, a Parquet table with one row a drive. Goes on with one of the same trials."""
+    kind: Literal["laboratory", "corridor", "room", "free_room", "rectilinear_room", "changing_room"] = "changing_room"
+    """Worlds to drive through."""
+    runs: Annotated[int, tyro.conf.arg(metavar="N")] = 1000
+    """Number of drives."""
+    scans: Annotated[int, tyro.conf.arg(metavar="N")] = 50
+    """Number of scans of each."""
+    scanner: Literal["pls", "lms200", "utm30lx", "rplidar_a1"] = "pls"
+    """The instrument; the map builder knows its noise."""
+    preset: Literal["default", "paper"] = "default"
+    """The method."""
+    config: Path | None = None
+    """TOML file with tables [thresholds], [noise], [rules], [persistence]; goes over the preset."""
+    pose_sigma: Annotated[tuple[float, float, float], tyro.conf.arg(metavar="X Y THETA")] = (0.01, 0.01, 0.002)
+    """Standard deviations of every pose, m m rad."""
+    pose_correlation: Annotated[float, tyro.conf.arg(metavar="A")] = 0.0
+    """Of the pose errors, from one scan to the next: 0 for independent ones, 1 for one error that stays."""
+    pose_error: Literal["independent", "persistent", "unknown"] = "unknown"
+    """What the map builder believes of that."""
+    seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0
+    """Decides everything that is left to chance."""
+    devices: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Processors, or accelerators, that share the work. All of them unless given."""
+    quiet: bool = False
+    """No progress."""
+    json: bool = False
+    """Print the summary as JSON."""
+
+
 DEMO_NOISE = {"range_sigma": 0.015, "bearing_sigma": 0.0005, "pose_sigma": (0.01, 0.01, 0.002)}
 """What the demo log was made with."""
 
@@ -168,6 +203,15 @@ SCANS_EXPLAINED = 500
 
 MOST_SCANS = 20_000
 """Of a simulated drive, which is held in memory as a whole."""
+
+MOST_RUNS = 10**8
+"""Of trials."""
+
+BATCH_RUNS = 32
+"""Drives that one device simulates side by side."""
+
+CHUNK_RUNS = 256
+"""Drives after which the results are written, of all devices together."""
 
 SCAN_SECONDS = 0.2
 """Between two simulated scans."""
@@ -199,6 +243,7 @@ def main(args: list[str] | None = None) -> int:
         | Annotated[Extract, tyro.conf.subcommand("extract")]
         | Annotated[Simulate, tyro.conf.subcommand("simulate")]
         | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+        | Annotated[Trials, tyro.conf.subcommand("trials")]
         | Annotated[Verify, tyro.conf.subcommand("verify")],
         prog="linemap",
         description="Maps of line segments and circles from 2D range scans, with covariances that can be believed.",
@@ -210,6 +255,7 @@ def main(args: list[str] | None = None) -> int:
     from linemap_jax.io.config import ConfigError
     from linemap_jax.io.log import LogError
     from linemap_jax.io.map_file import MapFileError
+    from linemap_jax.io.table import TableError
     from linemap_jax.io.worlds import WorldFileError
 
     try:
@@ -219,10 +265,12 @@ def main(args: list[str] | None = None) -> int:
             return _simulate(command)
         if isinstance(command, Evaluate):
             return _evaluate(command)
+        if isinstance(command, Trials):
+            return _trials(command)
         if isinstance(command, Extract):
             return _extract(command)
         return _build(_of_demo(command) if isinstance(command, Demo) else command)
-    except (LogError, OutputError, MapFileError, WorldFileError, ConfigError, UsageError) as error:
+    except (LogError, OutputError, MapFileError, TableError, WorldFileError, ConfigError, UsageError) as error:
         print(f"linemap: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
@@ -449,7 +497,7 @@ def _simulate(command: Simulate) -> int:
     return 0
 
 
-def _check_simulate(command: Simulate) -> None:
+def _check_simulate(command: Simulate | Trials) -> None:
     """Refuse numbers that make no sense."""
     if not 1 <= command.scans <= MOST_SCANS:
         raise UsageError(f"--scans must be from 1 to {MOST_SCANS}, not {command.scans}")
@@ -461,7 +509,7 @@ def _check_simulate(command: Simulate) -> None:
         raise UsageError(f"--seed must be from 0 to 2^63 - 1, not {command.seed}")
 
 
-def _made_world(command: Simulate, key: "Array") -> "World":
+def _made_world(command: Simulate | Trials, key: "Array") -> "World":
     """The world of `--kind`."""
     import jax.numpy as jnp
 
@@ -636,6 +684,103 @@ def _scores_in_words(scores: dict[str, Any]) -> str:
     return "\n".join(said)
 
 
+def _trials(command: Trials) -> int:
+    _check_simulate(command)
+    if not 1 <= command.runs <= MOST_RUNS:
+        raise UsageError(f"--runs must be from 1 to {MOST_RUNS}, not {command.runs}")
+    options = _method(command)
+    mesh = _devices(command.devices)
+    import jax
+    import jax.numpy as jnp
+    from tqdm import tqdm
+
+    from linemap_jax.io.table import ResultsTable
+    from linemap_jax.lab.batch import run_chunks
+    from linemap_jax.lab.scanners import PRESETS
+    from linemap_jax.lab.trials import Conditions, Trial, columns_of, summary, trial
+
+    thresholds, noise = options.pop("thresholds"), options.pop("noise")
+    conditions = Conditions(
+        scanner=PRESETS[command.scanner](),
+        cov_pose=jnp.diag(jnp.square(jnp.asarray(command.pose_sigma))),
+        correlation=command.pose_correlation,
+    )
+
+    def experiment(key: "Array", *common: Any) -> Any:
+        of_world, of_run = jax.random.split(key)
+        thresholds, noise, conditions = common
+        run = Trial(key=of_run, world=_made_world(command, of_world), thresholds=thresholds, noise=noise)
+        return trial(run, conditions, scans=command.scans, pose_error=command.pose_error, **options)
+
+    batches = max(1, CHUNK_RUNS // (BATCH_RUNS * mesh.size))
+    chunk = BATCH_RUNS * batches * mesh.size
+    told = {k: v for k, v in dataclasses.asdict(command).items() if k not in ("output", "devices", "quiet", "json")}
+    told |= {"config": command.config and command.config.read_text(encoding="utf-8")}
+    table = ResultsTable(command.output, told)
+    if table.rows % chunk and table.rows < command.runs:
+        raise UsageError(f"{command.output} holds {table.rows} drives, which are no chunks of {chunk}: give --devices")
+    keys = jax.random.split(jax.random.key(command.seed), command.runs)
+    started = time.perf_counter()
+    done = table.rows
+    with tqdm(
+        total=command.runs, initial=done, unit="drive", disable=True if command.quiet else None, file=sys.stderr
+    ) as progress:
+        if done < command.runs:
+            common = (thresholds, noise, conditions)
+            for first, rows in run_chunks(
+                experiment, keys, *common, mesh=mesh, batch=BATCH_RUNS, batches=batches, start=done
+            ):
+                table.append(first, columns_of(rows))
+                progress.update(len(rows.lines))
+    seconds = time.perf_counter() - started
+    score = summary(table.read())
+    score |= {"seconds": seconds, "drives_per_second": (command.runs - done) / seconds}
+    if command.json:
+        print(json.dumps(score, indent=2))
+    else:
+        print(f"{_trials_in_words(score)}\n{command.runs} drives -> {command.output}")
+    return 0
+
+
+def _trials_in_words(score: dict[str, Any]) -> str:
+    def share(name: str) -> str:
+        return "-" if score[name] is None else f"{score[name]:.2%}"
+
+    def number(name: str, scale: float = 1.0) -> str:
+        return "-" if score[name] is None else f"{scale * score[name]:.2f}"
+
+    return "\n".join(
+        [
+            f"length within 5 cm: precision {share('precision')}, recall {share('recall')}",
+            f"{share('duplicates')} of {score['walls']} walls are held twice, {score['fragments']} pieces are too "
+            f"many; {share('phantom_lines')} of {score['lines']} lines are phantoms",
+            f"error {number('offset_rms_m', 100)} cm, {number('angle_rms_rad', 180 / math.pi)} degrees (rms); "
+            f"mean NEES {number('mean_nees')}, {share('covered')} inside the 95 % ellipse",
+            f"{share('missed_poles')} of {score['poles']} poles are missed, {share('phantom_circles')} of "
+            f"{score['circles']} circles are phantoms",
+            f"matches: {share('false_matches')} false, {share('missed_matches')} missed of {score['matches']}",
+            f"{share('gone')} of {score['vanished']} vanished things are gone after three scans that could tell, "
+            f"{share('noticed')} of {score['appeared']} new ones are there",
+        ]
+    )
+
+
+def _devices(count: int | None) -> "Mesh":
+    """So many devices in a row; of processors, as many as the machine has."""
+    processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    import jax
+
+    # Without effect where jax has counted its devices already, or where they are accelerators.
+    with contextlib.suppress(RuntimeError):
+        jax.config.update("jax_num_cpu_devices", processors)
+    from linemap_jax.lab.batch import mesh_of_devices
+
+    try:
+        return mesh_of_devices(count)
+    except ValueError as error:
+        raise UsageError(f"--devices: {error}") from error
+
+
 def _verify(command: Verify) -> int:
     _keep_compilations()
     from linemap_jax.lab.verification import as_dict, as_text, verify
@@ -656,13 +801,10 @@ def _options(command: LogOptions) -> dict[str, Any]:
     import jax
 
     jax.config.update("jax_enable_x64", command.dtype == "float64")
-    _keep_compilations()
-    from linemap_jax.core.settings import Mount, Persistence, SensorNoise, preset
-    from linemap_jax.io.config import read_config
+    from linemap_jax.core.settings import Mount, SensorNoise
 
-    options = preset(command.preset) | {"noise": SensorNoise(), "mount": Mount(), "persistence": Persistence()}
-    for section, fields in (read_config(command.config) if command.config else {}).items():
-        options[section] = dataclasses.replace(options[section], **fields)
+    options = _method(command)
+    options |= {"mount": Mount(), "noise": options["noise"] or SensorNoise()}
     sigmas = {"range_sigma": command.range_sigma, "bearing_sigma": command.bearing_sigma}
     given = {name: sigma for name, sigma in sigmas.items() if sigma is not None}
     options["noise"] = dataclasses.replace(options["noise"], **given)
@@ -671,6 +813,18 @@ def _options(command: LogOptions) -> dict[str, Any]:
     if command.covariance is not None:
         options["covariance"] = command.covariance
     return options | {"jacobians": command.jacobians, "segmentation": command.segmentation}
+
+
+def _method(command: LogOptions | Trials) -> dict[str, Any]:
+    """The preset, and the settings file over it; no noise unless the file states it."""
+    _keep_compilations()
+    from linemap_jax.core.settings import Persistence, SensorNoise, preset
+    from linemap_jax.io.config import read_config
+
+    options = preset(command.preset) | {"noise": None, "persistence": Persistence()}
+    for section, fields in (read_config(command.config) if command.config else {}).items():
+        options[section] = dataclasses.replace(options[section] or SensorNoise(), **fields)
+    return options
 
 
 def _check(command: LogOptions) -> None:

@@ -1,4 +1,4 @@
-"""`linemap simulate` and `linemap evaluate`: from a world to a log and back to a score."""
+"""`linemap simulate`, `linemap evaluate`, `linemap trials`: from a world to a log and back to a score."""
 
 import dataclasses
 import json
@@ -10,6 +10,7 @@ from typing import Any, get_args
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import shapely
 
@@ -317,3 +318,43 @@ def bad_world(folder: Path) -> Path:
     path = folder / "bad.geojson"
     path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature("Point", ["here"])]}))
     return path
+
+
+# --- trials ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cli, "BATCH_RUNS", 2)
+    monkeypatch.setattr(cli, "CHUNK_RUNS", 2)
+
+
+@pytest.mark.usefixtures("small_chunks")
+def test_trials_that_were_stopped_go_on_with_the_same_result(run, tmp_path: Path) -> None:
+    args = "trials", "-o", tmp_path / "out", "--kind", "room", "--runs", 3, "--scans", 3, "--devices", 1
+    status, out, err = run(*args)
+    assert (status, err) == (0, "")
+    assert "3 drives -> " in out
+    assert re.search(r"precision \d+\.\d\d%, recall \d+\.\d\d%", out)
+    parts = sorted((tmp_path / "out").glob("*.parquet"))
+    whole = [pq.read_table(part) for part in parts]
+    assert [len(part) for part in whole] == [2, 1]
+    assert set(whole[0].column("walls").to_pylist()) <= {3, 4}  # of the room, with 180 degrees
+
+    # As if it had been killed after the first chunk
+    parts[1].unlink()
+    status, out, err = run(*args, "--json")
+    assert (status, err) == (0, "")
+    assert json.loads(out)["runs"] == 3
+    assert [pq.read_table(part) for part in sorted((tmp_path / "out").glob("*.parquet"))] == whole
+
+
+def test_trials_that_make_no_sense_are_refused(refuse, tmp_path: Path) -> None:
+    out = "-o", tmp_path / "out"
+    assert refuse("trials", *out, "--runs", 0) == "--runs must be from 1 to 100000000, not 0"
+    assert refuse("trials", *out, "--scans", 0) == f"--scans must be from 1 to {cli.MOST_SCANS}, not 0"
+    assert "1000 devices was asked for" in refuse("trials", *out, "--devices", 1000)
+    assert refuse("trials", *out, "--config", tmp_path / "none.toml").startswith(f"cannot read {tmp_path}/none.toml")
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/thesis.txt").write_text("all of it")
+    assert "holds no table of results" in refuse("trials", "-o", tmp_path / "mine")

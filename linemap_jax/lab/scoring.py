@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from linemap_jax.core.frames import dot, perp, rotate, unit
 from linemap_jax.core.settings import Mount, Number
-from linemap_jax.core.state import Circles, LineMap, Lines, Scan, pytree
+from linemap_jax.core.state import Circles, Extraction, LineMap, Lines, Scan, pytree
 from linemap_jax.lab.consistency import line_error, nees, walls_of
 from linemap_jax.lab.raycast import NOTHING, cast
 from linemap_jax.lab.scanners import Truth
@@ -288,11 +288,8 @@ def evaluate(
     divided = _divide(pieces, gates.cell, seen.cells.shape[1])
     on_walls = _length(divided, _cover(divided, along_walls).near)
     line_share = jnp.where(lines.valid, on_walls / jnp.where(pieces.length > 0, pieces.length, 1), 0)
-    # A metre aside counts as a metre less beside: of walls that a line runs along for its whole length, the nearest.
-    beside = along_walls.near[..., 1] - along_walls.near[..., 0]
-    wall_of_line = _least((along_walls.aside - beside).T, (beside > 0).T)
     phantom = lines.valid & (line_share < 0.5)
-    wall_of_line = jnp.where(phantom, -1, wall_of_line)
+    wall_of_line = jnp.where(phantom, -1, _wall_of_line(along_walls))
     of_line = jax.tree.map(lambda x: _pick(wall_of_line, x), walls_of(world))
     assigned = wall_of_line >= 0
     error = jnp.where(assigned[:, None], line_error(lines, of_line), 0)
@@ -356,6 +353,61 @@ def held(line_map: LineMap, world: World, seen: Seen, *, scan_index: Time = 0, g
     by_lines = _against_walls(line_map.lines, world, seen, gates)
     near = _circles_on_poles(line_map.circles, world, gates)
     return _held(by_lines, near, world, seen, scan_index, gates)
+
+
+class Matches(NamedTuple):
+    """What became of the lines of one scan that walls have given."""
+
+    true: Int[Array, ""]  # matched with a line of the map that runs along the same wall
+    false: Int[Array, ""]  # matched with one that does not
+    missed: Int[Array, ""]  # not matched, although the map holds their stretch of the wall
+
+
+@jax.jit
+def judge_matches(
+    lines: Lines,
+    found: Extraction,
+    line_slot: Int[Array, " L"],
+    world: World,
+    truth: Truth,
+    *,
+    scan_index: Time = 0,
+    gates: Gates | None = None,
+) -> Matches:
+    """Whether the lines of a scan have been matched with the right ones of the map.
+
+    A line of a scan belongs to the wall that most of its beams have met.
+
+    Args:
+      lines: of the map before that scan, `K`.
+      found: in the scan, `L` lines.
+      line_slot: with which line of the map each was matched, or a negative number; of the `Report` of `update`.
+      world: `S` segments.
+      truth: what the beams met.
+      scan_index: of the scan.
+      gates: what counts as the same.
+    """
+    gates = gates or Gates()
+    walls = _walls(world)
+    walls = walls._replace(valid=there(world.segments, scan_index))
+    size, count = found.lines.valid.shape[0], walls.valid.shape[0]
+    own = (found.line_of_beam[:, None] == jnp.arange(size)[None]).astype(jnp.float32)
+    met = (truth.thing[:, None] == jnp.arange(count)[None]).astype(jnp.float32)
+    beams = jnp.sum(own[:, :, None] * met[:, None], 0)
+    wall = jnp.where(found.lines.valid & (jnp.max(beams, -1) > 0), jnp.argmax(beams, -1), -1)
+    wall_of_slot = _wall_of_line(_stretches(_lines(lines), walls, gates))
+
+    matched = (line_slot >= 0) & (wall >= 0)
+    right = matched & (wall_of_slot[jnp.maximum(line_slot, 0)] == wall)
+
+    # Stretches of the wall of each line: of itself, and of all lines of the map
+    mine = _stretches(walls, _lines(found.lines), gates).near[jnp.arange(size), wall]
+    held = jnp.moveaxis(_stretches(walls, _lines(lines), gates).near, 1, 0)[wall]
+    common = jnp.minimum(mine[:, None, 1], held[..., 1]) - jnp.maximum(mine[:, None, 0], held[..., 0])
+    enough = jnp.minimum(jnp.asarray(gates.overlap, common.dtype), (mine[:, 1] - mine[:, 0]) / 2)
+    there_before = jnp.any((common >= enough[:, None]) & (wall_of_slot[None] == wall[:, None]), -1)
+    missed = (wall >= 0) & (line_slot < 0) & there_before & (mine[:, 1] > mine[:, 0])
+    return Matches(*(jnp.sum(x, dtype=jnp.int32) for x in (right, matched & ~right, missed)))
 
 
 def scans_until(
@@ -508,6 +560,15 @@ def _stretches(pieces: _Straight, along: _Straight, gates: Gates) -> _Stretches:
         return _Stretches(near, beside, jnp.abs(y + jnp.sum(near) / 2 * sin))
 
     return jax.vmap(jax.vmap(one, (0, None)), (None, 0))(pieces, along)
+
+
+def _wall_of_line(along_walls: _Stretches) -> Int[Array, " K"]:
+    """The wall that each line runs along for longest, -1 for none.
+
+    A metre aside counts as a metre less beside: of walls that a line runs along for its whole length, the nearest.
+    """
+    beside = along_walls.near[..., 1] - along_walls.near[..., 0]
+    return _least((along_walls.aside - beside).T, (beside > 0).T)
 
 
 def _both(a: Float[Array, "2"], b: Float[Array, "2"]) -> Float[Array, "2"]:

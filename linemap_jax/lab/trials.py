@@ -1,0 +1,231 @@
+"""A trial: one simulated drive, mapped scan by scan and scored; made to be run by the thousand.
+
+`trial` is an experiment of `batch`: a pure function of what one run differs by, whose outcome is one row of a table.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from linemap_jax.core.extract import extract
+from linemap_jax.core.mapping import empty_map, update
+from linemap_jax.core.settings import Capacity, Number, SensorNoise, Thresholds
+from linemap_jax.core.state import LineMap, Pose, Status, pytree
+from linemap_jax.lab import scoring
+from linemap_jax.lab.consistency import CHI2_95
+from linemap_jax.lab.robot import drive, estimate_poses
+from linemap_jax.lab.scanners import Scanner, noise_of, simulate_scan
+from linemap_jax.lab.scoring import GONE, MIN_RETURNS, THERE, Seen
+from linemap_jax.lab.world import NEVER, World
+
+SCANS_TO_NOTICE = 3
+"""A change has been noticed in time if the map shows it after so many scans that could tell."""
+
+
+@pytree
+class Trial:
+    """What one trial may differ by from another."""
+
+    key: Any  # of all noise
+    world: World  # with a path of one way point at least
+    thresholds: Thresholds = Thresholds()
+    noise: SensorNoise | None = None  # what the map builder believes; that of the scanner unless given
+
+
+@pytree
+class Conditions:
+    """What the trials have in common."""
+
+    scanner: Scanner
+    cov_pose: Float[Array, "3 3"]  # of each believed pose, in the axes of the world. m^2, m rad, rad^2
+    correlation: Number = 0.0  # of the pose error, from one scan to the next; see `robot.pose_errors`
+
+
+@pytree
+class Outcome:
+    """What a trial comes to. Lengths and errors are those of `scoring.evaluate` after the last scan."""
+
+    line_length: Float[Array, ""]  # m, of all lines
+    line_length_on_walls: Float[Array, ""]  # m
+    wall_seen: Float[Array, ""]  # m of wall that have been seen
+    wall_held: Float[Array, ""]  # m of that on which a line is
+    lines: Int[Array, ""]
+    phantom_lines: Int[Array, ""]
+    walls: Int[Array, ""]  # that have been seen
+    duplicates: Int[Array, ""]  # walls that are held twice
+    fragments: Int[Array, ""]  # pieces too many
+    lines_on_walls: Int[Array, ""]
+    square_error: Float[Array, "2"]  # m^2, rad^2: sums over the lines on walls
+    nees: Float[Array, ""]  # sum over them
+    covered: Int[Array, ""]  # of them inside the 95 % ellipse
+    poles: Int[Array, ""]  # that are there and have been seen
+    missed_poles: Int[Array, ""]
+    circles: Int[Array, ""]
+    phantom_circles: Int[Array, ""]
+    true_matches: Int[Array, ""]  # of lines, over all scans; see `scoring.Matches`
+    false_matches: Int[Array, ""]
+    missed_matches: Int[Array, ""]
+    vanished: Int[Array, ""]  # objects that the map held, and that beams then passed through in `SCANS_TO_NOTICE` scans
+    gone: Int[Array, ""]  # of these, gone from the map after so many
+    appeared: Int[Array, ""]  # objects that came, and of which `SCANS_TO_NOTICE` scans had returns
+    noticed: Int[Array, ""]  # of these, in the map after so many
+    full: Bool[Array, ""]  # the map or a scan had no slot left
+
+
+def trial(
+    run: Trial,
+    conditions: Conditions,
+    *,
+    scans: int,
+    map_capacity: Capacity = Capacity(96, 48),
+    capacity: Capacity = Capacity(24, 32),
+    **options: Any,
+) -> Outcome:
+    """Drive along the path of a world, map what is seen, and hold the map against the truth.
+
+    Args:
+      run: what this trial differs by.
+      conditions: what all have in common.
+      scans: number of scans along the path.
+      map_capacity: slots of the map.
+      capacity: slots for what one scan holds.
+      **options: of `update`; not `thresholds` and `noise`, which are those of the run.
+    """
+    world, scanner = run.world, conditions.scanner
+    dtype = world.dtype
+    of_scans, of_poses = jax.random.split(run.key)
+    path = drive(world.path, count=scans)
+    believed = estimate_poses(
+        of_poses, path, jnp.asarray(conditions.cov_pose, dtype), correlation=conditions.correlation
+    )
+    noise = noise_of(scanner) if run.noise is None else run.noise
+    options = {"jacobians": "analytic", "thresholds": run.thresholds, "noise": noise, "capacity": capacity} | options
+    of_extract = {k: v for k, v in options.items() if k not in ("pose_error", "persistence")}
+
+    def step(carry: tuple[LineMap, Seen], x: tuple[Array, Array, Pose, Array]) -> tuple[tuple[LineMap, Seen], Any]:
+        before, seen = carry
+        key, pose, estimate, index = x
+        scan, truth = simulate_scan(key, world, pose, scanner, scan_index=index)
+        line_map, report = update(before, scan, estimate, **options)
+        found = extract(scan, estimate, **of_extract)
+        matches = scoring.judge_matches(before.lines, found, report.line_slot, world, truth, scan_index=index)
+        seen = scoring.look(seen, world, scan, truth, pose)
+        beams = scoring.beams_on_objects(world, scan, truth, pose, scan_index=index)
+        held = scoring.held(line_map, world, seen, scan_index=index)
+        return (line_map, seen), (matches, held, *beams, report.status)
+
+    start = (empty_map(map_capacity, dtype), scoring.seen_nothing(world))
+    index = jnp.arange(scans, dtype=jnp.int32)
+    (line_map, seen), (matches, held, on, through, status) = jax.lax.scan(
+        step, start, (jax.random.split(of_scans, scans), path, believed, index)
+    )
+    matches = jax.tree.map(jnp.sum, matches)
+    last = scans - 1
+    score = scoring.evaluate(line_map, world, seen, scan_index=last)
+    on_wall = score.wall_of_line >= 0
+    vanished, gone, appeared, noticed = _changes(world, held, on, through)
+    full = Status.SCAN_LINES_FULL | Status.SCAN_CIRCLES_FULL | Status.MAP_LINES_FULL | Status.MAP_CIRCLES_FULL
+    return Outcome(
+        line_length=score.line_length,
+        line_length_on_walls=score.line_length_on_walls,
+        wall_seen=jnp.sum(score.wall_seen),
+        wall_held=jnp.sum(score.wall_held),
+        lines=_count(line_map.lines.valid),
+        phantom_lines=_count(score.phantom_line),
+        walls=_count(score.wall_seen > 0),
+        duplicates=score.duplicates,
+        fragments=score.fragments,
+        lines_on_walls=_count(on_wall),
+        square_error=jnp.sum(jnp.square(score.line_error), 0),
+        nees=jnp.sum(score.line_nees),
+        covered=_count(on_wall & (score.line_nees < CHI2_95[2])),
+        poles=_count(score.missed_pole | (score.circles_of_pole > 0)),
+        missed_poles=_count(score.missed_pole),
+        circles=_count(line_map.circles.valid),
+        phantom_circles=_count(score.phantom_circle),
+        true_matches=matches.true,
+        false_matches=matches.false,
+        missed_matches=matches.missed,
+        vanished=_count(vanished),
+        gone=_count(gone),
+        appeared=_count(appeared),
+        noticed=_count(noticed),
+        full=jnp.any(status & int(full) != 0),
+    )
+
+
+def _changes(
+    world: World, held: Float[Array, "T O"], on: Int[Array, "T O"], through: Int[Array, "T O"]
+) -> tuple[Bool[Array, " O"], Bool[Array, " O"], Bool[Array, " O"], Bool[Array, " O"]]:
+    """Which objects the map has held that then vanished, and which of them are gone in time; and as much of new ones.
+
+    A change that is done before three scans could tell of it counts as well; one that had fewer and is not, does not.
+    """
+    appears, vanishes, exists = scoring.times_of_objects(world)
+    scans = held.shape[0]
+    before = held[jnp.clip(vanishes - 1, 0, scans - 1), jnp.arange(held.shape[1])]
+    until_gone, is_gone = scoring.scans_until(held < GONE, through >= MIN_RETURNS, vanishes)
+    until_there, is_there = scoring.scans_until(held >= THERE, on >= MIN_RETURNS, appears)
+
+    def judged(counts: Array, until: Array, is_done: Array) -> tuple[Array, Array]:
+        counts = counts & (until > 0) & (is_done | (until >= SCANS_TO_NOTICE))
+        return counts, counts & is_done & (until <= SCANS_TO_NOTICE)
+
+    vanished = exists & (vanishes < NEVER) & (vanishes > appears) & (before >= THERE)
+    return *judged(vanished, until_gone, is_gone), *judged(exists & (appears > 0), until_there, is_there)
+
+
+def _count(which: Bool[Array, " A"]) -> Int[Array, ""]:
+    return jnp.sum(which, dtype=jnp.int32)
+
+
+def columns_of(outcomes: Outcome) -> dict[str, np.ndarray]:
+    """Stacked outcomes as the columns of a table, by the names of the fields."""
+    return {field.name: np.asarray(getattr(outcomes, field.name)) for field in dataclasses.fields(Outcome)}
+
+
+def summary(columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """What many trials come to together: totals, and shares of these; None for a share of nothing.
+
+    Args:
+      columns: as of `columns_of`, `[R]` rows each.
+    """
+    total = {name: np.sum(values, 0) for name, values in columns.items()}
+
+    def share(part: str, whole: str) -> float | None:
+        return float(total[part] / total[whole]) if total[whole] > 0 else None
+
+    on_walls = int(total["lines_on_walls"])
+    offset, angle = np.sqrt(total["square_error"] / on_walls).tolist() if on_walls else (None, None)
+    matches = int(total["true_matches"] + total["false_matches"] + total["missed_matches"])
+    return {
+        "runs": len(columns["lines"]),
+        "precision": share("line_length_on_walls", "line_length"),
+        "recall": share("wall_held", "wall_seen"),
+        "lines": int(total["lines"]),
+        "phantom_lines": share("phantom_lines", "lines"),
+        "walls": int(total["walls"]),
+        "duplicates": share("duplicates", "walls"),
+        "fragments": int(total["fragments"]),
+        "offset_rms_m": offset,
+        "angle_rms_rad": angle,
+        "mean_nees": share("nees", "lines_on_walls"),
+        "covered": share("covered", "lines_on_walls"),
+        "poles": int(total["poles"]),
+        "missed_poles": share("missed_poles", "poles"),
+        "circles": int(total["circles"]),
+        "phantom_circles": share("phantom_circles", "circles"),
+        "matches": matches,
+        "false_matches": float(total["false_matches"] / matches) if matches else None,
+        "missed_matches": float(total["missed_matches"] / matches) if matches else None,
+        "vanished": int(total["vanished"]),
+        "gone": share("gone", "vanished"),
+        "appeared": int(total["appeared"]),
+        "noticed": share("noticed", "appeared"),
+        "full": int(total["full"]),
+    }

@@ -1,0 +1,108 @@
+"""Trials: what is counted is what happened, alone and in batches."""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from linemap_jax import Capacity, Thresholds, empty_map, extract, update
+from linemap_jax.core.settings import preset
+from linemap_jax.core.state import NEW, Pose
+from linemap_jax.lab import generators
+from linemap_jax.lab.batch import run_batch
+from linemap_jax.lab.scanners import Scanner, pls, simulate_scan, sweep
+from linemap_jax.lab.scoring import judge_matches
+from linemap_jax.lab.trials import Conditions, Trial, columns_of, summary, trial
+from linemap_jax.lab.world import World
+
+SCANS = 16
+RUNS = 4
+COV_POSE = jnp.diag(jnp.array([0.01, 0.01, 0.002]) ** 2)
+COARSE = dataclasses.replace(pls(), bearings=sweep(-np.pi / 2, np.pi / 2, 181))
+
+
+@jax.jit
+def worlds(keys: jax.Array) -> World:
+    return jax.vmap(partial(generators.changing_room, scans=SCANS))(keys)
+
+
+CONDITIONS = Conditions(scanner=COARSE, cov_pose=COV_POSE)
+
+
+def experiment(run: Trial, conditions: Conditions) -> object:
+    return trial(run, conditions, scans=SCANS, **OPTIONS)
+
+
+OPTIONS = {name: value for name, value in preset("default").items() if name != "thresholds"}
+
+
+@pytest.fixture(scope="module")
+def runs() -> Trial:
+    # The last one takes a new line for a known one only if it lies on the very same spot.
+    of_runs = [Thresholds()] * (RUNS - 1) + [Thresholds(match_nis=1e-6)]
+    thresholds = jax.tree.map(lambda *x: jnp.stack(x), *jax.tree.map(jnp.asarray, of_runs))
+    keys = jax.random.split(jax.random.key(3), RUNS)
+    return Trial(key=keys, world=worlds(keys), thresholds=thresholds)
+
+
+@pytest.fixture(scope="module")
+def outcomes(runs: Trial) -> dict[str, np.ndarray]:
+    return columns_of(run_batch(experiment, runs, CONDITIONS, batch=2))
+
+
+def test_a_trial_does_not_depend_on_those_beside_it(runs, outcomes):
+    alone = run_batch(experiment, jax.tree.map(lambda x: x[1:2], runs), CONDITIONS, batch=2)
+    for name, values in columns_of(alone).items():
+        np.testing.assert_allclose(values[0], outcomes[name][1], rtol=1e-4, err_msg=name)
+
+
+def test_good_maps_score_well(outcomes):
+    score = summary({name: values[:-1] for name, values in outcomes.items()})
+    assert score["runs"] == RUNS - 1
+    assert score["precision"] > 0.9
+    assert score["recall"] > 0.9
+    assert score["duplicates"] < 0.1
+    assert score["false_matches"] < 0.05
+    assert score["offset_rms_m"] < 0.02
+    assert not score["full"]
+    assert score["appeared"] >= score["noticed"] > 0
+    assert outcomes["walls"].min() >= 4
+
+
+def test_thresholds_make_a_difference(outcomes):
+    missed = outcomes["missed_matches"] / np.maximum(outcomes["true_matches"] + outcomes["missed_matches"], 1)
+    assert missed[-1] > 0.5 > 2 * missed[:-1].max()
+
+
+def test_shares_of_nothing_are_none(outcomes):
+    score = summary({name: np.zeros_like(values) for name, values in outcomes.items()})
+    assert {score[name] for name in ("precision", "recall", "mean_nees", "gone", "false_matches", "offset_rms_m")} == {
+        None
+    }
+
+
+def test_matches_are_judged_by_the_walls():
+    world = generators.room(8.0, 6.0)
+    pose = jnp.array([1.0, 0.5, 0.3])
+    scanner = Scanner(bearings=sweep(-np.pi, np.pi * 0.99, 360), range_sigma=0.005)
+    scan, truth = simulate_scan(jax.random.key(0), world, pose, scanner)
+    estimate = Pose(mean=pose, cov=COV_POSE)
+    capacity = Capacity(8, 8)
+    line_map, _ = update(empty_map(capacity), scan, estimate, capacity=capacity)
+    found = extract(scan, estimate, capacity=capacity)
+    assert int(found.lines.valid.sum()) == 5  # the wall behind is cut where the sweep begins
+
+    def judged(slots: jax.Array) -> tuple[int, ...]:
+        return tuple(int(x) for x in judge_matches(line_map.lines, found, slots, world, truth))
+
+    matched = update(line_map, scan, estimate, capacity=capacity)[1].line_slot
+    assert judged(matched) == (5, 0, 0)
+    assert judged(jnp.full_like(matched, NEW)) == (0, 0, 5)
+    wrong = jnp.where(matched >= 0, jnp.roll(matched, 2), matched)
+    true, false, missed = judged(jnp.where(found.lines.valid, jnp.maximum(wrong, 0), NEW))
+    assert false > 0
+    assert true + false == 5
+    assert missed == 0
