@@ -1,5 +1,6 @@
 """The pipeline against the plain NumPy reading in `oracle.py`, on real logs."""
 
+import dataclasses
 from functools import partial
 from typing import Any
 
@@ -11,12 +12,24 @@ from real_logs import LOGS, one, scans_of
 
 from linemap_jax import Capacity, Mount, SensorNoise, empty_map, extract, preset, update
 from linemap_jax.core.settings import Persistence
-from linemap_jax.core.state import LEFT_OUT
+from linemap_jax.core.state import LEFT_OUT, Pose, Scan
 
 SCAN = Capacity(64, 96)
 MAP = Capacity(512, 512)
 EVERY = {"intel": 3, "aces": 3, "fhw": 3, "freiburg-079": 24}
 """Every n-th scan is compared: the oracle takes 5 ms for one."""
+
+
+BEAMS = 361
+"""Scans are filled up to so many beams, so that one compilation serves all logs."""
+
+
+def filled(log: str, which: slice) -> tuple[Scan, Pose]:
+    """Scans of a log with masked beams behind their own, and poses."""
+    scans, poses = scans_of(log, which)
+    pad = [(0, 0), (0, BEAMS - scans.ranges.shape[1])]
+    beams = {name: np.pad(np.asarray(getattr(scans, name)), pad) for name in ("ranges", "bearings", "valid")}
+    return dataclasses.replace(scans, **beams), poses
 
 
 def oracle_options(options: dict[str, Any]) -> dict[str, Any]:
@@ -29,22 +42,24 @@ def fields(scan: Any) -> tuple[Any, ...]:
     return scan.ranges, scan.bearings, scan.valid, float(scan.spacing)
 
 
-@partial(jax.jit, static_argnames=("name", "jacobians"))
-def extract_all(scans: Any, poses: Any, name: str, jacobians: str = "autodiff") -> Any:
-    """Extraction of a stack of scans with a preset."""
-    one_scan = partial(extract, capacity=SCAN, jacobians=jacobians, **preset(name))
-    return jax.lax.map(lambda x: one_scan(*x), (scans, poses))
+# As in `build`: these options compile in half the time.
+quick = partial(jax.jit, compiler_options={"xla_cpu_use_fusion_emitters": False})
+
+
+@partial(quick, static_argnames="name")
+def extract_one(scan: Any, pose: Any, name: Any) -> Any:
+    return extract(scan, pose, capacity=SCAN, **preset(name))
 
 
 @pytest.mark.parametrize("name", ["default", "paper"])
 @pytest.mark.parametrize("log", LOGS)
 def test_extraction_is_that_of_the_oracle(log: str, name: str) -> None:
     options = preset(name)
-    scans, poses = scans_of(log, slice(None, None, EVERY[log]))
-    found = jax.tree.map(np.asarray, extract_all(scans, poses, name))
+    scans, poses = filled(log, slice(None, None, EVERY[log]))
     options = oracle_options(options)
-    for t in range(len(found.status)):
-        scan, pose, mine = one(scans, t), one(poses, t), one(found, t)
+    for t in range(len(scans.ranges)):
+        scan, pose = one(scans, t), one(poses, t)
+        mine = jax.tree.map(np.asarray, extract_one(scan, pose, name))
         theirs = oracle.extract(*fields(scan), pose.mean, pose.cov, capacity=SCAN, **options)
         if theirs.deciding_margin < 1e-9:
             continue
@@ -74,13 +89,13 @@ def test_extraction_is_that_of_the_oracle(log: str, name: str) -> None:
 
 @pytest.mark.parametrize("log", LOGS)
 def test_float32_extraction_is_that_of_the_oracle(log: str) -> None:
-    scans, poses = scans_of(log, slice(None, None, 4 * EVERY[log]))
+    scans, poses = filled(log, slice(None, None, 4 * EVERY[log]))
     lower = jax.tree.map(lambda x: x.astype("float32") if x.dtype == np.float64 else x, (scans, poses))
-    found = jax.tree.map(np.asarray, extract_all(*lower, "default"))
     options = oracle_options(preset("default"))
     same = total = 0
-    for t in range(len(found.status)):
-        scan, pose, mine = one(lower[0], t), one(lower[1], t), one(found, t)
+    for t in range(len(scans.ranges)):
+        scan, pose = one(lower[0], t), one(lower[1], t)
+        mine = jax.tree.map(np.asarray, extract_one(scan, pose, "default"))
         scan, pose = jax.tree.map(lambda x: x.astype("float64") if x.dtype == np.float32 else x, (scan, pose))
         theirs = oracle.extract(*fields(scan), pose.mean, pose.cov, capacity=SCAN, **options)
         total += 1
@@ -99,17 +114,10 @@ def test_float32_extraction_is_that_of_the_oracle(log: str) -> None:
 PERSISTENCE = Persistence(share=0.7, correlation=0.95)
 
 
-# As in `build`: these options compile in half the time.
-@partial(jax.jit, static_argnames=("name", "pose_error"), compiler_options={"xla_cpu_use_fusion_emitters": False})
-def update_all(line_map: Any, scans: Any, poses: Any, name: str, pose_error: str) -> Any:
-    """The map after each scan, and the reports."""
+@partial(quick, static_argnames=("name", "pose_error"))
+def update_one(line_map: Any, scan: Any, pose: Any, name: Any, pose_error: Any) -> Any:
     options = preset(name) | {"pose_error": pose_error, "persistence": PERSISTENCE}
-
-    def step(line_map: Any, x: Any) -> Any:
-        line_map, report = update(line_map, *x, capacity=SCAN, **options)
-        return line_map, (line_map, report)
-
-    return jax.lax.scan(step, line_map, (scans, poses))[1]
+    return update(line_map, scan, pose, capacity=SCAN, **options)
 
 
 @pytest.mark.parametrize(
@@ -124,14 +132,15 @@ def update_all(line_map: Any, scans: Any, poses: Any, name: str, pose_error: str
     ],
 )
 def test_map_is_that_of_the_oracle_slot_by_slot(log: str, name: str, pose_error: str, count: int) -> None:
-    scans, poses = scans_of(log, slice(count))
-    maps, reports = jax.tree.map(np.asarray, update_all(empty_map(MAP, np.float64), scans, poses, name, pose_error))
+    scans, poses = filled(log, slice(count))
+    line_map = empty_map(MAP, np.float64)
     options = oracle_options(preset(name)) | {"pose_error": pose_error, "persistence": PERSISTENCE}
     theirs = oracle.empty_map(MAP)
     for t in range(count):
         scan, pose = one(scans, t), one(poses, t)
         theirs, report = oracle.update(theirs, fields(scan), pose.mean, pose.cov, scan_capacity=SCAN, **options)
-        mine, said = one(maps, t), one(reports, t)
+        line_map, said = update_one(line_map, scan, pose, name, pose_error)
+        mine, said = jax.tree.map(np.asarray, (line_map, said))
         for name_of_count in ("added", "fused", "merged", "trimmed", "split", "deleted", "status"):
             assert getattr(said, name_of_count) == getattr(report, name_of_count), f"{name_of_count}, scan {t}"
         # What a scan holds may have free slots between.
