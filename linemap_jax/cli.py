@@ -195,6 +195,32 @@ class Trials:
     """Print the summary as JSON."""
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Calibrate:
+    """Tell the noise of the scanner and of the poses from a log."""
+
+    log: tyro.conf.Positional[Path]
+    """CARMEN log, plain or .gz."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE.toml")] = None
+    """Settings file for --config of the other commands, with the noise of the scanner."""
+    scans: Annotated[int, tyro.conf.arg(metavar="N")] = 1000
+    """Number of scans that are used at most, from the first on."""
+    lag: Annotated[int, tyro.conf.arg(metavar="N")] = 1
+    """Poses are compared with those N scans later: errors that last longer are not seen."""
+    range_max: Annotated[float | None, tyro.conf.arg(metavar="M")] = None
+    """Ranges from here on are no-returns, m. What the log states, or 50, unless given."""
+    laser_offset: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y THETA")] = None
+    """Pose of the laser on the robot, m m rad. Used only with poses that are the robot's."""
+    strict: bool = False
+    """Refuse a log with malformed lines, instead of skipping and counting them."""
+    overwrite: bool = False
+    """Replace output that is there already."""
+    quiet: bool = False
+    """No warnings."""
+    json: bool = False
+    """Print the result as JSON."""
+
+
 DEMO_NOISE = {"range_sigma": 0.015, "bearing_sigma": 0.0005, "pose_sigma": (0.01, 0.01, 0.002)}
 """What the demo log was made with."""
 
@@ -244,6 +270,7 @@ def main(args: list[str] | None = None) -> int:
         | Annotated[Simulate, tyro.conf.subcommand("simulate")]
         | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
         | Annotated[Trials, tyro.conf.subcommand("trials")]
+        | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
         | Annotated[Verify, tyro.conf.subcommand("verify")],
         prog="linemap",
         description="Maps of line segments and circles from 2D range scans, with covariances that can be believed.",
@@ -267,6 +294,8 @@ def main(args: list[str] | None = None) -> int:
             return _evaluate(command)
         if isinstance(command, Trials):
             return _trials(command)
+        if isinstance(command, Calibrate):
+            return _calibrate(command)
         if isinstance(command, Extract):
             return _extract(command)
         return _build(_of_demo(command) if isinstance(command, Demo) else command)
@@ -578,7 +607,7 @@ def _against_world(command: Evaluate, path: Path, line_map: "LineMap") -> dict[s
         raise UsageError(f"{path}: {error}") from error
     seen, at = None, NEVER - 1
     if command.log is not None:
-        log = _open_evaluated(command, command.log)
+        log = _open_plain(command, command.log)
         with _progress(command, log):
             seen, scans = seen_in_log(world, _plain_chunks(log), chunk=CHUNK)
         at = scans - 1
@@ -618,7 +647,7 @@ def _against_log(command: Evaluate, path: Path, line_map: "LineMap") -> dict[str
     from linemap_jax.build import CHUNK
     from linemap_jax.lab.evaluation import evaluate_log
 
-    log = _open_evaluated(command, path)
+    log = _open_plain(command, path)
     scans = sum(1 for _ in log)
     _warn(command, log)
     with _progress(command, log):
@@ -634,7 +663,7 @@ def _against_log(command: Evaluate, path: Path, line_map: "LineMap") -> dict[str
     }
 
 
-def _open_evaluated(command: Evaluate, path: Path) -> "Log":
+def _open_plain(command: Evaluate | Calibrate, path: Path) -> "Log":
     from linemap_jax.io.log import open_log
 
     return open_log(path, strict=command.strict, range_max=command.range_max)
@@ -763,6 +792,62 @@ def _trials_in_words(score: dict[str, Any]) -> str:
             f"{share('noticed')} of {score['appeared']} new ones are there",
         ]
     )
+
+
+def _calibrate(command: Calibrate) -> int:
+    if not 2 <= command.scans <= MOST_SCANS:
+        raise UsageError(f"--scans must be from 2 to {MOST_SCANS}, not {command.scans}")
+    if not 1 <= command.lag < command.scans:
+        raise UsageError(f"--lag must be from 1 to less than the number of scans, not {command.lag}")
+    if command.output:
+        _check_output(command.output.parent, command.output, overwrite=command.overwrite)
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    _keep_compilations()
+    import numpy as np
+
+    from linemap_jax.core.settings import Mount, SensorNoise
+    from linemap_jax.io.atomic import atomic_write
+    from linemap_jax.io.scans import chunks_of_readings
+    from linemap_jax.lab.calibration import pose_noise, sensor_noise
+
+    log = _open_plain(command, command.log)
+    chunk = next(chunks_of_readings(log, command.scans, cov_pose=np.zeros((3, 3)), dtype="float64"))
+    _warn(command, log)
+    mount = Mount(*command.laser_offset) if command.laser_offset else Mount()
+    try:
+        sensor = sensor_noise(chunk.scans)
+        noise = SensorNoise(range_sigma=float(sensor.sigma[0]), bearing_sigma=float(sensor.sigma[1]))
+        poses = pose_noise(chunk.scans, chunk.poses.mean, noise, mount, lag=command.lag)
+    except ValueError as error:
+        raise UsageError(f"{command.log}: {error}") from error
+    rows = {
+        name: {"sigma": sigma, "from": low, "to": high}
+        for estimate, names in (
+            (sensor, ("range_m", "bearing_rad")),
+            (poses, ("x_m", "y_m", "theta_rad", "walls_m", "walls_rad")),
+        )
+        for name, sigma, (low, high) in zip(names, estimate.sigma.tolist(), estimate.interval.tolist(), strict=True)
+    }
+    if command.output:
+        text = f"[noise]\nrange_sigma = {noise.range_sigma:.4g}\nbearing_sigma = {noise.bearing_sigma:.4g}\n"
+        _make_folder(command.output.parent)
+        with atomic_write(command.output, overwrite=command.overwrite) as path:
+            path.write_text(text, encoding="utf-8")
+    if command.json:
+        print(json.dumps(rows | {"beams": sensor.used, "lines": poses.used, "scans": len(chunk.timestamps)}, indent=2))
+        return 0
+    sigmas = {name: f"{row['sigma']:.3g}" for name, row in rows.items()}
+    print(f"from {sensor.used} beams and {poses.used} pairs of lines in {len(chunk.timestamps)} scans, 95 % intervals:")
+    for name, row in rows.items():
+        what, unit = name.split("_")
+        print(f"  {what:8s} {sigmas[name]} {unit} ({row['from']:.3g} to {row['to']:.3g})")
+    print(
+        f"--range-sigma {sigmas['range_m']} --bearing-sigma {sigmas['bearing_rad']} "
+        f"--pose-sigma {sigmas['x_m']} {sigmas['y_m']} {sigmas['theta_rad']}"
+    )
+    return 0
 
 
 def _devices(count: int | None) -> "Mesh":
@@ -922,12 +1007,12 @@ def _progress(command: LogOptions | Evaluate, log: "Log") -> Iterator[None]:
         log.progress = None
 
 
-def _warn(command: LogOptions | Evaluate, log: "Log") -> None:
+def _warn(command: LogOptions | Evaluate | Calibrate, log: "Log") -> None:
     for warning in log.notes.warnings():
         _say(command, f"warning: {log.path}: {warning}")
 
 
-def _say(command: LogOptions | Evaluate, sentence: str) -> None:
+def _say(command: LogOptions | Evaluate | Calibrate, sentence: str) -> None:
     if not command.quiet:
         print(f"linemap: {sentence}", file=sys.stderr)
 

@@ -19,6 +19,7 @@ from linemap_jax.core.mapping import empty_map
 from linemap_jax.core.settings import Capacity
 from linemap_jax.core.state import LineMap
 from linemap_jax.io.carmen_writer import write_carmen
+from linemap_jax.io.config import read_config
 from linemap_jax.io.log import open_log
 from linemap_jax.io.map_file import write_map
 from linemap_jax.io.worlds import read_world
@@ -358,3 +359,29 @@ def test_trials_that_make_no_sense_are_refused(refuse, tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/thesis.txt").write_text("all of it")
     assert "holds no table of results" in refuse("trials", "-o", tmp_path / "mine")
+
+
+# --- calibrate -------------------------------------------------------------------------------------------------------
+
+
+def test_noise_is_told_from_a_log_and_taken_by_build(run, tmp_path: Path) -> None:
+    args = "--kind", "room", "--scans", 40, "--pose-sigma", 0.02, 0.02, 0.004, "--quiet"
+    assert run("simulate", "-o", tmp_path / "drive", *args)[0] == 0
+    log, config = tmp_path / "drive/scans.log.gz", tmp_path / "new" / "noise.toml"
+    status, out, err = run("calibrate", log, "-o", config, "--json")
+    assert (status, err) == (0, "")
+    found = json.loads(out)
+    assert found["scans"] == 40
+    assert found["range_m"]["sigma"] == pytest.approx(np.hypot(0.05 / 3, 0.01 / np.sqrt(12)), rel=0.1)
+    for name, sigma in (("x_m", 0.02), ("y_m", 0.02), ("theta_rad", 0.004)):
+        assert found[name]["from"] / 1.5 < sigma < found[name]["to"] * 1.5
+    assert read_config(config)["noise"]["range_sigma"] == pytest.approx(found["range_m"]["sigma"], rel=1e-3)
+
+
+def test_what_no_noise_can_be_told_from_is_refused(refuse, tmp_path: Path, drive: Path) -> None:
+    assert refuse("calibrate", tmp_path / "none.log").startswith(f"{tmp_path}/none.log: cannot be read")
+    log = drive / "scans.log.gz"
+    assert refuse("calibrate", log, "--lag", 0).startswith("--lag must be from 1")
+    assert refuse("calibrate", log, "--scans", 1).startswith("--scans must be from 2")
+    (tmp_path / "noise.toml").write_text("")
+    assert "--overwrite" in refuse("calibrate", log, "-o", tmp_path / "noise.toml")
