@@ -185,6 +185,8 @@ class Trials:
     """Of the pose errors, from one scan to the next: 0 for independent ones, 1 for one error that stays."""
     pose_error: Literal["independent", "persistent", "unknown"] = "unknown"
     """What the map builder believes of that."""
+    sweep: Annotated[tuple[str, ...], tyro.conf.arg(metavar="[NAME ...]")] = ()
+    """Thresholds to vary, one at a time, in the same drives: each from a quarter to four times its value."""
     seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0
     """Decides everything that is left to chance."""
     devices: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
@@ -721,12 +723,13 @@ def _trials(command: Trials) -> int:
     mesh = _devices(command.devices)
     import jax
     import jax.numpy as jnp
+    import numpy as np
     from tqdm import tqdm
 
     from linemap_jax.io.table import ResultsTable
     from linemap_jax.lab.batch import run_chunks
     from linemap_jax.lab.scanners import PRESETS
-    from linemap_jax.lab.trials import Conditions, Trial, columns_of, summary, trial
+    from linemap_jax.lab.trials import Conditions, Trial, columns_of, summary, sweep, trial
 
     thresholds, noise = options.pop("thresholds"), options.pop("noise")
     conditions = Conditions(
@@ -735,40 +738,78 @@ def _trials(command: Trials) -> int:
         correlation=command.pose_correlation,
     )
 
-    def experiment(key: "Array", *common: Any) -> Any:
-        of_world, of_run = jax.random.split(key)
-        thresholds, noise, conditions = common
-        run = Trial(key=of_run, world=_made_world(command, of_world), thresholds=thresholds, noise=noise)
-        return trial(run, conditions, scans=command.scans, pose_error=command.pose_error, **options)
+    known = [field.name for field in dataclasses.fields(thresholds)]
+    for name in command.sweep:
+        if name not in known:
+            raise UsageError(f"--sweep: there is no threshold {name!r}: choose from {', '.join(known)}")
+    varied, variants = sweep(thresholds, command.sweep) if command.sweep else ([("", 0.0)], _stacked(thresholds))
+
+    def experiment(run: Any, *common: Any) -> Any:
+        noise, conditions = common
+        of_world, of_drive = jax.random.split(run["key"])
+        of_run = Trial(key=of_drive, world=_made_world(command, of_world), thresholds=run["thresholds"], noise=noise)
+        return trial(of_run, conditions, scans=command.scans, pose_error=command.pose_error, **options)
 
     batches = max(1, CHUNK_RUNS // (BATCH_RUNS * mesh.size))
     chunk = BATCH_RUNS * batches * mesh.size
     told = {k: v for k, v in dataclasses.asdict(command).items() if k not in ("output", "devices", "quiet", "json")}
     told |= {"config": command.config and command.config.read_text(encoding="utf-8")}
     table = ResultsTable(command.output, told)
-    if table.rows % chunk and table.rows < command.runs:
-        raise UsageError(f"{command.output} holds {table.rows} drives, which are no chunks of {chunk}: give --devices")
-    keys = jax.random.split(jax.random.key(command.seed), command.runs)
+    total, done = command.runs * len(varied), table.rows
+    if done % chunk and done < total:
+        raise UsageError(f"{command.output} holds {done} drives, which are no chunks of {chunk}: give --devices")
+    # All variants of one drive stand side by side.
+    drive, variant = np.divmod(np.arange(total), len(varied))
+    runs = {
+        "key": jax.random.split(jax.random.key(command.seed), command.runs)[drive],
+        "thresholds": jax.tree.map(lambda x: x[variant], variants),
+    }
     started = time.perf_counter()
-    done = table.rows
     with tqdm(
-        total=command.runs, initial=done, unit="drive", disable=True if command.quiet else None, file=sys.stderr
+        total=total, initial=done, unit="drive", disable=True if command.quiet else None, file=sys.stderr
     ) as progress:
-        if done < command.runs:
-            common = (thresholds, noise, conditions)
-            for first, rows in run_chunks(
-                experiment, keys, *common, mesh=mesh, batch=BATCH_RUNS, batches=batches, start=done
-            ):
-                table.append(first, columns_of(rows))
-                progress.update(len(rows.lines))
+        common = (noise, conditions)
+        chunks = run_chunks(experiment, runs, *common, mesh=mesh, batch=BATCH_RUNS, batches=batches, start=done)
+        for first, rows in chunks if done < total else ():
+            here = slice(first, first + len(rows.lines))
+            which = [varied[i] for i in variant[here]]
+            columns: dict[str, Any] = {"drive": drive[here]}
+            if command.sweep:
+                columns |= {"threshold": [name for name, _ in which], "value": [value for _, value in which]}
+            table.append(first, columns | columns_of(rows))
+            progress.update(len(rows.lines))
     seconds = time.perf_counter() - started
-    score = summary(table.read())
-    score |= {"seconds": seconds, "drives_per_second": (command.runs - done) / seconds}
-    if command.json:
-        print(json.dumps(score, indent=2))
+    results = table.read()
+    speed = {"seconds": seconds, "drives_per_second": (total - done) / seconds}
+    if command.sweep:
+        scores = [
+            {"threshold": name, "value": value, **summary({k: v[i :: len(varied)] for k, v in results.items()})}
+            for i, (name, value) in enumerate(varied)
+        ]
+        print(json.dumps({"variants": scores, **speed}, indent=2) if command.json else _sweep_in_words(scores))
     else:
-        print(f"{_trials_in_words(score)}\n{command.runs} drives -> {command.output}")
+        score = summary(results) | speed
+        print(json.dumps(score, indent=2) if command.json else _trials_in_words(score))
+    if not command.json:
+        print(f"{total} drives -> {command.output}")
     return 0
+
+
+def _stacked(tree: Any) -> Any:
+    """A stack of one."""
+    import jax
+    import jax.numpy as jnp
+
+    return jax.tree.map(lambda x: jnp.asarray(x)[None], tree)
+
+
+def _sweep_in_words(scores: list[dict[str, Any]]) -> str:
+    names = ("precision", "recall", "duplicates", "false_matches", "missed_matches", "gone", "noticed")
+    lines = [f"{'threshold':22s} {'value':>8s} " + " ".join(f"{name:>14s}" for name in names)]
+    for score in scores:
+        cells = ["-" if score[name] is None else f"{score[name]:.2%}" for name in names]
+        lines.append(f"{score['threshold']:22s} {score['value']:8.4g} " + " ".join(f"{cell:>14s}" for cell in cells))
+    return "\n".join(lines)
 
 
 def _trials_in_words(score: dict[str, Any]) -> str:

@@ -350,12 +350,28 @@ def test_trials_that_were_stopped_go_on_with_the_same_result(run, tmp_path: Path
     assert [pq.read_table(part) for part in sorted((tmp_path / "out").glob("*.parquet"))] == whole
 
 
+@pytest.mark.usefixtures("small_chunks")
+def test_thresholds_are_varied_in_the_same_drives(run, tmp_path: Path) -> None:
+    args = "--kind", "room", "--runs", 1, "--scans", 4, "--sweep", "match_nis", "--devices", 1, "--json"
+    status, out, err = run("trials", "-o", tmp_path / "out", *args)
+    assert (status, err) == (0, "")
+    variants = json.loads(out)["variants"]
+    assert [x["threshold"] for x in variants] == ["match_nis"] * 7
+    assert [x["value"] for x in variants] == pytest.approx([9.21 * x for x in (0.25, 0.5, 0.7, 1, 1.4, 2, 4)])
+    missed = [x["missed_matches"] for x in variants]
+    assert missed == sorted(missed, reverse=True)
+    table = pq.read_table(tmp_path / "out")
+    assert set(table.column("drive").to_pylist()) == {0}
+    assert table.column("value").to_pylist() == pytest.approx([x["value"] for x in variants])
+
+
 def test_trials_that_make_no_sense_are_refused(refuse, tmp_path: Path) -> None:
     out = "-o", tmp_path / "out"
     assert refuse("trials", *out, "--runs", 0) == "--runs must be from 1 to 100000000, not 0"
     assert refuse("trials", *out, "--scans", 0) == f"--scans must be from 1 to {cli.MOST_SCANS}, not 0"
     assert "1000 devices was asked for" in refuse("trials", *out, "--devices", 1000)
     assert refuse("trials", *out, "--config", tmp_path / "none.toml").startswith(f"cannot read {tmp_path}/none.toml")
+    assert "there is no threshold 'nis': choose from gap_distance, " in refuse("trials", *out, "--sweep", "nis")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/thesis.txt").write_text("all of it")
     assert "holds no table of results" in refuse("trials", "-o", tmp_path / "mine")

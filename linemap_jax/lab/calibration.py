@@ -108,12 +108,12 @@ def residuals_of(scan: Scan, noise: SensorNoise, *, capacity: Capacity = SCAN_CA
 
     sway = -reach * tangent / cosine
     sigma = jnp.sqrt(noise.range_sigma**2 + jnp.square(sway * noise.bearing_sigma))
-    z = jnp.where(used, along / jnp.where(sigma > 0, sigma, 1), 0)
+    z = used * along / jnp.where(sigma > 0, sigma, 1)
     following = jnp.concatenate([z[1:], jnp.zeros_like(z[:1])])
     member &= used[:, None]
     inner = member[:-1] & member[1:]
-    together = jnp.sum(jnp.where(inner, (z * following)[:-1, None], 0), 0)
-    square = jnp.sum(jnp.where(member, jnp.square(z)[:, None], 0), 0)
+    together = jnp.sum(inner * (z * following)[:-1, None], 0)
+    square = jnp.sum(member * jnp.square(z)[:, None], 0)
     white = together <= CORRELATED * square / jnp.sqrt(jnp.maximum(jnp.sum(member, 0), 1))
     used &= white[label]
     return Residuals(

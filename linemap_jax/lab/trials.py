@@ -4,7 +4,7 @@
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -184,6 +184,25 @@ def _count(which: Bool[Array, " A"]) -> Int[Array, ""]:
     return jnp.sum(which, dtype=jnp.int32)
 
 
+FACTORS = (0.25, 0.5, 0.7, 1.0, 1.4, 2.0, 4.0)
+"""By which a threshold is multiplied in a sweep."""
+
+
+def sweep(thresholds: Thresholds, names: Sequence[str]) -> tuple[list[tuple[str, float]], Thresholds]:
+    """Thresholds of which one at a time is varied, by `FACTORS`.
+
+    Args:
+      thresholds: from which is started.
+      names: of the fields that are varied.
+
+    Returns:
+      Name and value of what is varied; and the thresholds, stacked alike.
+    """
+    varied = [(name, factor * float(getattr(thresholds, name))) for name in names for factor in FACTORS]
+    variants = [dataclasses.replace(thresholds, **{name: value}) for name, value in varied]
+    return varied, jax.tree.map(lambda *x: jnp.asarray(x), *variants)
+
+
 def columns_of(outcomes: Outcome) -> dict[str, np.ndarray]:
     """Stacked outcomes as the columns of a table, by the names of the fields."""
     return {field.name: np.asarray(getattr(outcomes, field.name)) for field in dataclasses.fields(Outcome)}
@@ -195,7 +214,7 @@ def summary(columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
     Args:
       columns: as of `columns_of`, `[R]` rows each.
     """
-    total = {name: np.sum(values, 0) for name, values in columns.items()}
+    total = {field.name: np.sum(columns[field.name], 0) for field in dataclasses.fields(Outcome)}
 
     def share(part: str, whole: str) -> float | None:
         return float(total[part] / total[whole]) if total[whole] > 0 else None
