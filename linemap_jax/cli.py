@@ -574,8 +574,7 @@ def _evaluate(command: Evaluate) -> int:
         raise UsageError(f"--distance must be positive, not {command.distance}")
     if command.at is not None and not 0 <= command.at < 2**31 - 1:
         raise UsageError(f"--at must be from 0 to 2^31 - 2, not {command.at}")
-    if command.range_max is not None and not command.range_max > 0:
-        raise UsageError(f"--range-max must be positive, not {command.range_max}")
+    _check_range_max(command.range_max)
     import jax
 
     jax.config.update("jax_enable_x64", True)
@@ -742,7 +741,7 @@ def _trials(command: Trials) -> int:
     for name in command.sweep:
         if name not in known:
             raise UsageError(f"--sweep: there is no threshold {name!r}: choose from {', '.join(known)}")
-    varied, variants = sweep(thresholds, command.sweep) if command.sweep else ([("", 0.0)], _stacked(thresholds))
+    varied, variants = sweep(thresholds, command.sweep)
 
     def experiment(run: Any, *common: Any) -> Any:
         noise, conditions = common
@@ -795,14 +794,6 @@ def _trials(command: Trials) -> int:
     return 0
 
 
-def _stacked(tree: Any) -> Any:
-    """A stack of one."""
-    import jax
-    import jax.numpy as jnp
-
-    return jax.tree.map(lambda x: jnp.asarray(x)[None], tree)
-
-
 def _sweep_in_words(scores: list[dict[str, Any]]) -> str:
     names = ("precision", "recall", "duplicates", "false_matches", "missed_matches", "gone", "noticed")
     lines = [f"{'threshold':22s} {'value':>8s} " + " ".join(f"{name:>14s}" for name in names)]
@@ -840,6 +831,8 @@ def _calibrate(command: Calibrate) -> int:
         raise UsageError(f"--scans must be from 2 to {MOST_SCANS}, not {command.scans}")
     if not 1 <= command.lag < command.scans:
         raise UsageError(f"--lag must be from 1 to less than the number of scans, not {command.lag}")
+    _check_range_max(command.range_max)
+    _check_offset(command.laser_offset)
     if command.output:
         _check_output(command.output.parent, command.output, overwrite=command.overwrite)
     import jax
@@ -883,7 +876,8 @@ def _calibrate(command: Calibrate) -> int:
     print(f"from {sensor.used} beams and {poses.used} pairs of lines in {len(chunk.timestamps)} scans, 95 % intervals:")
     for name, row in rows.items():
         what, unit = name.split("_")
-        print(f"  {what:8s} {sigmas[name]} {unit} ({row['from']:.3g} to {row['to']:.3g})")
+        told = f"{row['from']:.3g} to {row['to']:.3g}" if row["to"] < 100 * row["from"] else "not told by this log"
+        print(f"  {what:8s} {sigmas[name]} {unit} ({told})")
     print(
         f"--range-sigma {sigmas['range_m']} --bearing-sigma {sigmas['bearing_rad']} "
         f"--pose-sigma {sigmas['x_m']} {sigmas['y_m']} {sigmas['theta_rad']}"
@@ -953,6 +947,16 @@ def _method(command: LogOptions | Trials) -> dict[str, Any]:
     return options
 
 
+def _check_range_max(range_max: float | None) -> None:
+    if range_max is not None and not range_max > 0:
+        raise UsageError(f"--range-max must be positive, not {range_max}")
+
+
+def _check_offset(offset: tuple[float, float, float] | None) -> None:
+    if offset is not None and not all(map(math.isfinite, offset)):
+        raise UsageError(f"--laser-offset must be finite, not {offset}")
+
+
 def _check(command: LogOptions) -> None:
     """Refuse numbers that make no sense."""
     inf = float("inf")
@@ -968,8 +972,7 @@ def _check(command: LogOptions) -> None:
         raise UsageError(f"--bearing-sigma must be zero or positive, not {command.bearing_sigma}")
     if not all(0 <= x < inf for x in command.pose_sigma):
         raise UsageError(f"--pose-sigma must be zero or positive, not {command.pose_sigma}")
-    if command.laser_offset is not None and not all(-inf < x < inf for x in command.laser_offset):
-        raise UsageError(f"--laser-offset must be finite, not {command.laser_offset}")
+    _check_offset(command.laser_offset)
 
 
 def _open(command: Build | Extract) -> "Log":

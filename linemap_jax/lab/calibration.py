@@ -9,8 +9,8 @@ of beams and lines:
   alone, no map comes into it. Errors that both poses share leave no trace: what is estimated is the part that is new
   within the lag.
 
-Nothing is selected by the noise that is to be estimated: lines are cut short of their ends, and associated by gates of
-fixed width.
+Little is selected by the noise that is to be estimated: lines are cut short of their ends, and associated by gates of
+fixed width. `OUTLIER` and `MISFIT` do select, far out, and take a little from the sigmas.
 """
 
 import dataclasses
@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from linemap_jax.core.extract import extract
 from linemap_jax.core.frames import dot, perp, reanchor, unit, wrap_angle
@@ -43,8 +43,7 @@ CORRELATED = 2.0
 """Lines whose successive residuals are correlated by so many sigmas more than noise would be are not one surface. That
 does not depend on how large the noise is, so that nothing is selected by it."""
 MISFIT = 3.0
-"""Lines whose misfit exceeds its expectation by so many sigmas are not one surface. Of those that are it takes one in
-some hundred, which lowers the sigmas by less than a thousandth."""
+"""Lines whose misfit exceeds its expectation by so many sigmas are not one surface."""
 SAME_ANGLE = 0.1
 """Lines of two scans are taken for one wall if they differ by less, rad,"""
 SAME_OFFSET = 0.25
@@ -73,7 +72,7 @@ class Residuals:
     along: Float[Array, "*t N"]  # m, range less the range at which the beam meets the line
     by_line: Float[Array, "*t N 2"]  # derivative of the latter by offset (per unit) and angle (m)
     sway: Float[Array, "*t N"]  # m / rad, by the bearing
-    line: Any  # [N] slot of its line, -1 for beams that are not used
+    line: Int[Array, "*t N"]  # slot of its line, -1 for beams that are not used
 
 
 @partial(jax.jit, static_argnames="capacity")
@@ -120,7 +119,7 @@ def residuals_of(scan: Scan, noise: SensorNoise, *, capacity: Capacity = SCAN_CA
         along=along * used,
         by_line=jnp.where(used[:, None], by_line, 0),
         sway=sway * used,
-        line=jnp.where(used, label, -1),
+        line=jnp.asarray(jnp.where(used, label, -1)),
     )
 
 
@@ -357,9 +356,11 @@ def pose_noise(
       capacity: slots for the lines of a scan.
 
     Raises:
-      ValueError: if hardly any line is seen by both scans of a pair.
+      ValueError: if there is no pair, or hardly any line is seen by both scans of a pair.
     """
     count = poses.shape[0]
+    if count <= lag:
+        raise ValueError(f"a pair of scans is {lag} apart, and there are {count} scans")
     first = np.asarray([t for t in range(count - lag) if (t // lag) % 2 == 0])
     pairs = np.stack([first, first + lag], -1)
     mount = jax.tree.map(lambda x: jnp.asarray(x, poses.dtype), mount or Mount())

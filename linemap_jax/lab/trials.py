@@ -196,10 +196,13 @@ def sweep(thresholds: Thresholds, names: Sequence[str]) -> tuple[list[tuple[str,
       names: of the fields that are varied.
 
     Returns:
-      Name and value of what is varied; and the thresholds, stacked alike.
+      Name and value of what is varied; and the thresholds, stacked alike. Without names, the thresholds as they are,
+      under an empty name.
     """
     varied = [(name, factor * float(getattr(thresholds, name))) for name in names for factor in FACTORS]
     variants = [dataclasses.replace(thresholds, **{name: value}) for name, value in varied]
+    if not varied:
+        varied, variants = [("", 0.0)], [thresholds]
     return varied, jax.tree.map(lambda *x: jnp.asarray(x), *variants)
 
 

@@ -56,6 +56,8 @@ def test_too_few_lines_are_said(drive):
         calibration.sensor_noise(blind, capacity=CAPACITY)
     with pytest.raises(ValueError, match="only 0 lines are seen by both scans"):
         calibration.pose_noise(blind, drive.poses.mean, SensorNoise(), capacity=CAPACITY)
+    with pytest.raises(ValueError, match=f"a pair of scans is {SCANS} apart, and there are {SCANS} scans"):
+        calibration.pose_noise(drive.scans, drive.poses.mean, SensorNoise(), lag=SCANS, capacity=CAPACITY)
 
 
 def test_the_restricted_likelihood_is_that_of_contrasts():
