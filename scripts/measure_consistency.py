@@ -1,10 +1,10 @@
 """Whether the covariances hold: the tables in README, measured by simulation.
 
-Usage: python scripts/measure_consistency.py [--runs N] [--fused-runs N] [--devices N] [--write]
+Usage: python scripts/measure_consistency.py [--runs N] [--fused-runs N] [--devices N] [--only TABLE] [--write]
 
 The cells are those of `linemap_jax.lab.consistency.cells`: walls and rooms, two noises of the range, two of the
 bearing, three errors of the pose; 361 beams. Poles stand at 2 and 5 m. Whatever leaves its band is printed cell by
-cell. With --write the tables go into README, between the markers.
+cell. With --write each table goes into README, between its markers.
 """
 
 import argparse
@@ -31,7 +31,6 @@ from linemap_jax.lab.consistency import Cell, Fit, Model, Sample, Verdict, judge
 from linemap_jax.lab.scanners import Scanner, sweep
 
 README = Path(__file__).resolve().parents[1] / "README.md"
-BEGIN, END = "<!-- consistency:begin -->", "<!-- consistency:end -->"
 BATCH = 250
 """Runs that are simulated side by side; their arrays stay in the cache of a core."""
 FUSED_NOISE = "; 0.01 m, 0.1 degree; "
@@ -46,25 +45,32 @@ def main() -> int:
     parser.add_argument("--runs", type=int, default=10_000, help="runs in each cell, of one scan")
     parser.add_argument("--fused-runs", type=int, default=1_000, help="runs in each cell, of fifty scans")
     parser.add_argument("--devices", type=int, default=2, help="processors to use")
+    parser.add_argument("--only", choices=("single", "fused", "poles"), help="measure one of the tables")
     parser.add_argument("--write", action="store_true", help="put the tables into README")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_num_cpu_devices", options.devices)
-    begin = time.perf_counter()
-    tables = []
-    for measure, runs in (
-        (single_scans, options.runs),
-        (fused_scans, options.fused_runs),
-        (poles, options.fused_runs),
-    ):
-        tables.append(measure(runs))
-        print(tables[-1], flush=True)
-    minutes = (time.perf_counter() - begin) / 60
-    text = "\n\n".join([*tables, f"Measured in {minutes:.0f} minutes on {options.devices} cores."])
-    if options.write:
-        before, rest = README.read_text().split(BEGIN)
-        README.write_text(f"{before}{BEGIN}\n{text}\n{END}{rest.split(END)[1]}")
+    tables = {
+        "single": (single_scans, options.runs),
+        "fused": (fused_scans, options.fused_runs),
+        "poles": (poles, options.fused_runs),
+    }
+    for name, (measure, runs) in tables.items():
+        if options.only in (None, name):
+            begin = time.perf_counter()
+            table = measure(runs)
+            minutes = (time.perf_counter() - begin) / 60
+            print(f"{table}\n\nin {minutes:.0f} minutes on {options.devices} cores\n", flush=True)
+            if options.write:
+                _write(name, table)
     return 0
+
+
+def _write(name: str, table: str) -> None:
+    """Put a table into README, between its markers."""
+    begin, end = (f"<!-- consistency-{name}:{edge} -->" for edge in ("begin", "end"))
+    before, rest = README.read_text().split(begin)
+    README.write_text(f"{before}{begin}\n{table}\n{end}{rest.split(end)[1]}")
 
 
 def single_scans(runs: int) -> str:

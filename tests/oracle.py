@@ -39,7 +39,7 @@ UNSURE_SIGMAS = 3.0
 # A beam more grazing than this (cosine of the incidence) does not say where it meets a line.
 SHALLOW = 0.02
 # What a scan says of a pose error that persists is known to this part: it depends on the pose.
-JACOBIAN_ERROR = 0.01
+JACOBIAN_ERROR = 0.005
 # Points whose scatter is flatter than this have no circle: determinant of the scatter over its squared trace.
 FLAT = 1e-6
 
@@ -53,6 +53,7 @@ class Lines:
     angle: np.ndarray  # [K]
     cov_independent: np.ndarray  # [K, 2, 2]
     sqrt_persistent: np.ndarray  # [K, 2, 3]
+    first_angle: np.ndarray  # [K]
     extent: np.ndarray  # [K, 2]
     var_extent: np.ndarray  # [K, 2]
     times_detected: np.ndarray  # [K]
@@ -692,6 +693,7 @@ def _line_of_run(sweep: Sweep, run: list[int], kept: list[int], *, covariance: s
         "angle": angle,
         "cov_independent": cov_measurement,
         "sqrt_persistent": jac_line_pose @ lower_root(sweep.cov_pose),
+        "first_angle": angle,
         "extent": extent,
         "var_extent": var_extent,
         "cov_measurement": cov_measurement,
@@ -955,6 +957,7 @@ def extract(
         angle=_stack(found, "angle", ()),
         cov_independent=_stack(found, "cov_independent", (2, 2)),
         sqrt_persistent=_stack(found, "sqrt_persistent", (2, 3)),
+        first_angle=_stack(found, "first_angle", ()),
         extent=_stack(found, "extent", (2,)),
         var_extent=_stack(found, "var_extent", (2,)),
         times_detected=np.ones(len(found), int),
@@ -1018,6 +1021,7 @@ def empty_map(capacity: Any) -> OracleMap:
             angle=np.zeros(k),
             cov_independent=np.tile(np.eye(2), (k, 1, 1)),
             sqrt_persistent=np.zeros((k, 2, 3)),
+            first_angle=np.zeros(k),
             extent=np.zeros((k, 2)),
             var_extent=np.ones((k, 2)),
             times_detected=np.zeros(k, int),
@@ -1284,7 +1288,22 @@ def group_new(pairs: list[Gates], unmatched: list[int], ties: Margin) -> dict[in
 # Fusion of lines
 
 
-def observe(target: Lines, pieces: Lines, *, share: float, thresholds: Any) -> tuple[np.ndarray, Error]:
+class Viewpoint(NamedTuple):
+    """Where a scan was taken."""
+
+    robot: np.ndarray  # m. Shape `[2]`
+    cov: np.ndarray  # of the pose. Shape `[3, 3]`
+
+
+def moved_by_pose(anchor: np.ndarray, angle: float, view: Viewpoint) -> np.ndarray:
+    """The square root of what a pose's error does to (offset, angle) of a line that moves with the robot, `[2, 3]`."""
+    normal, tangent = np.array([math.cos(angle), math.sin(angle)]), np.array([-math.sin(angle), math.cos(angle)])
+    return np.array([[*normal, tangent @ (view.robot - anchor)], [0, 0, 1]]) @ lower_root(view.cov)
+
+
+def observe(
+    target: Lines, pieces: Lines, *, share: float, thresholds: Any, view: Viewpoint | None = None
+) -> tuple[np.ndarray, Error]:
     """What pieces that one scan has seen of a line say of it together: least squares at the anchor of the target.
 
     The scan moves all of its pieces by one pose error, which is no noise between them.
@@ -1294,6 +1313,7 @@ def observe(target: Lines, pieces: Lines, *, share: float, thresholds: Any) -> t
       pieces: what was seen of it, with all of the pose error in the persisting part.
       share: how much of that may persist.
       thresholds: for the gates, which yield the residuals.
+      view: if given, what the pose's error does is reckoned for the direction that the target had at first.
 
     Returns:
       What to add to (offset, angle) of the target, and the error of that.
@@ -1304,7 +1324,10 @@ def observe(target: Lines, pieces: Lines, *, share: float, thresholds: Any) -> t
         s, flip = lever_matrix(g.lever[i]), sign_matrix(g.sign[i])
         weight = s.T @ np.linalg.inv(sandwich(flip, pieces.cov_independent[i]))
         information += weight @ s
-        of_pose += weight @ flip @ pieces.sqrt_persistent[i]
+        a = flip @ pieces.sqrt_persistent[i]
+        if view is not None and a.any():
+            a = moved_by_pose(pieces.anchor[i], target.first_angle[0], view)
+        of_pose += weight @ a
         vector += weight @ g.residual[i]
     c = np.linalg.inv(information)
     a = c @ of_pose
@@ -1364,9 +1387,11 @@ def _fuse_into(
     pose_error: PoseError,
     share: float,
     estimate_ends: bool,
+    view: Viewpoint | None = None,
 ) -> None:
     """Improve the line in a slot by what was seen of it."""
-    delta, seen = observe(lines.take(slot), pieces, share=share, thresholds=thresholds)
+    view = view if pose_error == "persistent" else None
+    delta, seen = observe(lines.take(slot), pieces, share=share, thresholds=thresholds, view=view)
     gain, error = combine(_error_of(lines, slot), seen, pose_error)
     _write(lines, slot, gain @ delta, error)
     outermost, var_outermost = seen_extent(lines.anchor[slot], lines.angle[slot], pieces)
@@ -1381,11 +1406,12 @@ def _fuse_into(
     _put(lines, slot, extent=extent, var_extent=var_extent)
 
 
-def _add(lines: Lines, slot: int, pieces: Lines, *, share: float, thresholds: Any) -> None:
+def _add(lines: Lines, slot: int, pieces: Lines, *, share: float, thresholds: Any, view: Viewpoint | None) -> None:
     """Put a new line into a free slot; the first of its pieces is the root."""
     root = pieces.take(0)
-    delta, error = observe(root, pieces, share=share, thresholds=thresholds)
+    delta, error = observe(root, pieces, share=share, thresholds=thresholds, view=view)
     _put(lines, slot, anchor=root.anchor[0], offset=root.offset[0], angle=root.angle[0], valid=True)
+    _put(lines, slot, first_angle=root.first_angle[0])
     _write(lines, slot, delta, error)
     extent, var_extent = seen_extent(root.anchor[0], lines.angle[slot], pieces)
     _put(lines, slot, extent=extent, var_extent=var_extent)
@@ -1580,6 +1606,7 @@ def _piece(line: Lines, a: float, b: float) -> dict[str, Any]:
         "angle": line.angle[0],
         "cov_independent": symmetric(sandwich(lever_matrix(tangent @ shift), line.cov_independent[0])),
         "sqrt_persistent": lever_matrix(tangent @ shift) @ line.sqrt_persistent[0],
+        "first_angle": line.first_angle[0],
         "extent": np.array([a, b]) + tangent @ shift,
         "var_extent": line.var_extent[0],
         "times_detected": line.times_detected[0],
@@ -1826,6 +1853,7 @@ def update(
         pairs,
         apex,
         report,
+        view=Viewpoint(sweep.p, sweep.cov_pose),
         thresholds=thresholds,
         rules=rules,
         pose_error=pose_error,
@@ -1877,6 +1905,7 @@ def _lines_at_once(
     apex: np.ndarray,
     report: Report,
     *,
+    view: Viewpoint,
     thresholds: Any,
     rules: Any,
     pose_error: PoseError,
@@ -1912,7 +1941,7 @@ def _lines_at_once(
 
     groups = group_new(pairs, unmatched, ties)
     for slot, index in pieces.items():
-        options = {"pose_error": pose_error, "share": share, "estimate_ends": rules.estimate_ends}
+        options = {"pose_error": pose_error, "share": share, "estimate_ends": rules.estimate_ends, "view": view}
         _fuse_into(lines, slot, found.lines.take(index), thresholds=thresholds, **options)
         report.fused += 1
     for index in groups.values():
@@ -1920,7 +1949,8 @@ def _lines_at_once(
         if slot is None:
             report.status |= Status.MAP_LINES_FULL
             continue
-        _add(lines, slot, found.lines.take(index), share=share, thresholds=thresholds)
+        first_view = view if pose_error == "persistent" else None
+        _add(lines, slot, found.lines.take(index), share=share, thresholds=thresholds, view=first_view)
         targets[index], report.line_slot[index] = slot, NEW
         report.added += 1
     return targets, suspects, []
@@ -1933,6 +1963,7 @@ def _lines_one_by_one(
     apex: np.ndarray,
     report: Report,
     *,
+    view: Viewpoint,
     thresholds: Any,
     rules: Any,
     pose_error: PoseError,
@@ -1966,7 +1997,7 @@ def _lines_one_by_one(
         report.line_nis[i], report.line_dof[i] = match.nis, match.dof
         if match.slot >= 0:
             error_model = known if match.slot in added else pose_error
-            options = {"pose_error": error_model, "share": share, "estimate_ends": rules.estimate_ends}
+            options = {"pose_error": error_model, "share": share, "estimate_ends": rules.estimate_ends, "view": view}
             _fuse_into(lines, match.slot, found.lines.take(i), thresholds=thresholds, **options)
             targets[i] = report.line_slot[i] = match.slot
             report.fused += 1
@@ -1978,7 +2009,7 @@ def _lines_one_by_one(
             if slot is None:
                 report.status |= Status.MAP_LINES_FULL
                 continue
-            _add(lines, slot, found.lines.take(i), share=share, thresholds=thresholds)
+            _add(lines, slot, found.lines.take(i), share=share, thresholds=thresholds, view=None)
             added.add(slot)
             targets[i], report.line_slot[i] = slot, NEW
             report.added += 1

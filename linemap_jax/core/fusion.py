@@ -13,16 +13,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from linemap_jax.core.frames import dot, shift_matrix, wrap_angle
+from linemap_jax.core.frames import dot, perp, shift_matrix, unit, wrap_angle
 from linemap_jax.core.matching import CircleMatches, compare_lines, with_sign
 from linemap_jax.core.propagation import apply, inverse, product, propagate, safe_sqrt, square_root, symmetric
 from linemap_jax.core.settings import Number, PoseError, Rules, Thresholds
 from linemap_jax.core.slots import choose, least, take
-from linemap_jax.core.state import Circles, Lines, pytree, squared
+from linemap_jax.core.state import Circles, Lines, Pose, pytree, squared
 
-JACOBIAN_ERROR = 0.01
-"""How well A is known, relative to its size: Jacobians are taken at an estimated pose, which is half a degree off. A
-gain that lets an error that persists cancel between two viewpoints would believe in A to the last digit."""
+JACOBIAN_ERROR = 0.005
+"""How well A is known, relative to its size: to first order, with a heading that is a third of a degree off. A gain
+that lets an error that persists cancel between two viewpoints would believe in A to the last digit."""
 
 
 @pytree
@@ -105,6 +105,29 @@ def forget(primitives: ErrorsT, share: Number) -> ErrorsT:
         cov_independent=primitives.cov_independent + (1 - share) * squared(primitives.sqrt_persistent),
         sqrt_persistent=jnp.sqrt(share) * primitives.sqrt_persistent,
     )
+
+
+def at_first_angle(pieces: Lines, model: Lines, pose: Pose) -> Lines:
+    """Pieces of lines, with the share of the pose error reckoned at the angle at which their line was first seen.
+
+    A scan moves with its pose as a rigid body: d(offset, angle) / d(x, y, theta) is the normal and the lever of the
+    robot, and (0, 0, 1). Taken at each piece's own angle, two views from one pose would differ in it by noise, and a
+    gain that lets an error that persists cancel between views would learn from that difference.
+
+    Args:
+      pieces: what a scan observed. Those on which the pose error has no influence stay as they are.
+      model: for each piece the line that it belongs to.
+      pose: of the robot.
+    """
+    # Reversed, the normal of the first view points the other way.
+    angle = model.first_angle + jnp.where(dot(unit(model.first_angle), pieces.normal) < 0, jnp.pi, 0)
+    normal = unit(angle)
+    lever = dot(perp(normal), pose.mean[None, :2] - pieces.anchor)
+    by_offset = jnp.concatenate([normal, lever[:, None]], -1)
+    by_angle = jnp.zeros_like(by_offset).at[:, 2].set(1)
+    root = product(jnp.stack([by_offset, by_angle], 1), square_root(pose.cov)[None])
+    some = jnp.any(pieces.sqrt_persistent != 0, (-2, -1))
+    return dataclasses.replace(pieces, sqrt_persistent=jnp.where(some[:, None, None], root, pieces.sqrt_persistent))
 
 
 def _size(cov: Float[Array, "*s n n"], unit: Float[Array, "*s n n"]) -> Float[Array, "*s"]:

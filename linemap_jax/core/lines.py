@@ -240,6 +240,7 @@ def measure_lines(
         angle=angle,
         cov_independent=cov_measurement,
         sqrt_persistent=product(jac_line_pose, square_root(pose.cov)[None]),
+        first_angle=angle,
         extent=extent,
         var_extent=_var_extent(points, pose, runs, angle, noise),
         times_detected=jnp.ones_like(runs.first),

@@ -124,7 +124,7 @@ def update(
             lines=fusion.forget(line_map.lines, kept),
             circles=fusion.forget(line_map.circles, kept),
         )
-    lines = _update_lines(line_map.lines, found, thresholds, rules, pose_error, lasting.share)
+    lines = _update_lines(line_map.lines, found, pose, thresholds, rules, pose_error, lasting.share)
     swept = _sweep(line_map.circles, lines, found, points, pose, thresholds, noise, rules)
     circles = _update_circles(
         line_map.circles,
@@ -175,7 +175,13 @@ class _LineUpdate(NamedTuple):
 
 
 def _update_lines(
-    model: Lines, found: Extraction, thresholds: Thresholds, rules: Rules, pose_error: PoseError, share: Array
+    model: Lines,
+    found: Extraction,
+    pose: Pose,
+    thresholds: Thresholds,
+    rules: Rules,
+    pose_error: PoseError,
+    share: Array,
 ) -> _LineUpdate:
     """Section 5.1: match, then fuse or add, then merge."""
     new = found.lines
@@ -192,6 +198,8 @@ def _update_lines(
     slot_of_leader, overflow = free_slots(leads, model.valid)
     targets = jnp.where(has_prior, match.slot, jnp.where(leader >= 0, slot_of_leader[leader], -1))
     mine = choose(has_prior, take(model, match.slot), take(new, leader))
+    if pose_error == "persistent":
+        new = fusion.at_first_angle(new, mine, pose)
     together = (targets[:, None] == targets[None]) & (targets >= 0)[None]
     fused = fusion.fuse_lines(mine, has_prior, new, together, thresholds, rules, pose_error, share)
     # All pieces of a line have the same result; the first one writes it.

@@ -111,7 +111,9 @@ class Lines:
 
     The covariance has two parts. Errors that are new in every scan average away; those of a pose error that persists do
     not, and are kept apart: to first order the error of (offset, angle) is `sqrt_persistent @ u` plus an independent
-    one, where u is the persisting part of the pose error in units of its own sigma.
+    one, where u is the persisting part of the pose error in units of its own sigma. How a pose error moves the line is
+    reckoned at one angle for good, `first_angle`, that of its first estimate: at the angles of several estimates the
+    same error would look as if it told the line's direction (Huang, Mourikis and Roumeliotis 2008).
     """
 
     anchor: Float[Array, "K 2"]  # m, world
@@ -119,6 +121,7 @@ class Lines:
     angle: Float[Array, " K"]  # rad, direction of the normal
     cov_independent: Float[Array, "K 2 2"]  # of (offset, angle): m^2, m rad, rad^2; what no other scan shares
     sqrt_persistent: Float[Array, "K 2 3"]  # square root of what other scans may share: m, rad
+    first_angle: Float[Array, " K"]  # rad, direction of the normal when the line was first seen
     extent: Float[Array, "K 2"]  # m, begin and end along the tangent; begin <= end
     var_extent: Float[Array, "K 2"]  # m^2, of the end points along the tangent
     times_detected: Int[Array, " K"]
@@ -270,6 +273,7 @@ def empty_lines(capacity: int, dtype: Any = None) -> Lines:
         angle=_filled((capacity,), 0, dtype),
         cov_independent=jnp.asarray(np.tile(np.eye(2, dtype=dtype), (capacity, 1, 1))),
         sqrt_persistent=_filled((capacity, 2, 3), 0, dtype),
+        first_angle=_filled((capacity,), 0, dtype),
         extent=_filled((capacity, 2), 0, dtype),
         var_extent=_filled((capacity, 2), 1, dtype),
         times_detected=_filled((capacity,), 0, np.int32),

@@ -1,10 +1,10 @@
 """The map as a JSON file that other tools read, and from which the map comes back without loss.
 
 A line is given twice: as the paper's view, `rho`, `theta`, `cov` of both, `begin`, `end`; and as its state, `anchor`,
-`offset`, `angle`, `cov_independent`, `sqrt_persistent`, `extent`, `var_extent` (the fields of `Lines`), which alone is
-read back; `cov_local` is the covariance of offset and angle. A circle has a `cov`, of (x, y, radius), and its two
-parts, only if it was fitted. Metres, radians, counter-clockwise. Each line and each circle stands on one line of the
-file.
+`offset`, `angle`, `cov_independent`, `sqrt_persistent`, `first_angle`, `extent`, `var_extent` (the fields of `Lines`),
+which alone is read back; `cov_local` is the covariance of offset and angle. A circle has a `cov`, of (x, y, radius),
+and its two parts, only if it was fitted. Metres, radians, counter-clockwise. Each line and each circle stands on one
+line of the file.
 """
 
 import dataclasses
@@ -35,6 +35,7 @@ _LINE_STATE = {
     "angle": (),
     "cov_independent": (2, 2),
     "sqrt_persistent": (2, 3),
+    "first_angle": (),
     "extent": (2,),
     "var_extent": (2,),
 }

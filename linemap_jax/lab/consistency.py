@@ -26,7 +26,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from linemap_jax.core.extract import extract
 from linemap_jax.core.frames import dot, unit, wrap_angle
-from linemap_jax.core.fusion import forget, fuse_lines
+from linemap_jax.core.fusion import at_first_angle, forget, fuse_lines
 from linemap_jax.core.lines import MIN_POINTS, measure_lines
 from linemap_jax.core.matching import compare_lines
 from linemap_jax.core.propagation import inverse, quadratic
@@ -208,7 +208,9 @@ def fused(
         scan = _scan_of_wall(of_scan, wall, on_wall, pose, scanner)
         line = _fit(scan, estimate, noise_of(scanner), Fit.DEFAULT)
         seen = jnp.sum(on_wall) >= MIN_POINTS
-        improved = [_improve(line, before, ~is_first, seen, model) for before, model in zip(held, models, strict=True)]
+        improved = [
+            _improve(line, estimate, before, ~is_first, seen, model) for before, model in zip(held, models, strict=True)
+        ]
         held = [after for after, _ in improved]
         samples = [_sample(after, wall, jnp.asarray(True)) for after in held]
         return held, (samples, jnp.stack([nis for _, nis in improved]))
@@ -222,7 +224,7 @@ def fused(
 
 
 def _improve(
-    line: Lines, before: Lines, has_prior: Bool[Array, ""], seen: Bool[Array, ""], model: Model
+    line: Lines, pose: Pose, before: Lines, has_prior: Bool[Array, ""], seen: Bool[Array, ""], model: Model
 ) -> tuple[Lines, Float[Array, ""]]:
     """A line of the map after one more scan, and the NIS before; without a prior it is the line of the scan.
 
@@ -232,18 +234,18 @@ def _improve(
     before = forget(before, jnp.square(persistence.correlation))
     before = jax.tree.map(lambda x, y: jnp.where(has_prior, x, y), before, line)
     nis = compare_lines(forget(line, persistence.share), before, Thresholds(), model.pose_error).nis
-    one = jax.tree.map(lambda x: x[None], (before, line))
+    before, line = jax.tree.map(lambda x: x[None], (before, line))
     after = fuse_lines(
-        one[0],
+        before,
         has_prior[None],
-        one[1],
+        at_first_angle(line, before, pose) if model.pose_error == "persistent" else line,
         jnp.ones((1, 1), bool),
         Thresholds(),
         Rules(),
         model.pose_error,
         persistence.share,
     )
-    after = jax.tree.map(lambda x, y: jnp.where(seen, x[0], y), after, before)
+    after = jax.tree.map(lambda x, y: jnp.where(seen, x, y)[0], after, before)
     return after, jnp.where(has_prior & seen, nis, 0)
 
 

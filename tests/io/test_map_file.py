@@ -43,6 +43,7 @@ def random_map(dtype: str, lines: int = 5, circles: int = 4, free: int = 2) -> L
             angle=number(rng.uniform(-np.pi, np.pi, k)),
             cov_independent=number(cov_l),
             sqrt_persistent=number(rng.normal(size=(k, 2, 3)) * [[0.02], [0.005]]),
+            first_angle=number(rng.uniform(-np.pi, np.pi, k)),
             extent=number(np.sort(rng.uniform(-4, 4, (k, 2)))),
             var_extent=number(rng.uniform(0, 1e-3, (k, 2))),
             times_detected=jnp.asarray(rng.integers(1, 40, k), jnp.int32),
@@ -114,6 +115,7 @@ def test_the_file_as_other_tools_see_it(tmp_path: Path) -> None:
         anchor=jnp.array([[0, 0], [2, 1]], jnp.float32),
         cov_independent=jnp.array([[[1, 0], [0, 1]], [[4e-4, 1e-5], [1e-5, 1e-6]]], jnp.float32),
         sqrt_persistent=jnp.array([np.zeros((2, 3)), [[0.02, 0, 0], [0, 0, 0]]], jnp.float32),
+        first_angle=jnp.array([0, 0.25], jnp.float32),
         extent=jnp.array([[0, 0], [-2, 2]], jnp.float32),
         times_detected=jnp.array([0, 7]),
         valid=jnp.array([False, True]),
@@ -141,7 +143,7 @@ def test_the_file_as_other_tools_see_it(tmp_path: Path) -> None:
     assert (line["times_detected"], line["anchor"], line["offset"], line["angle"]) == (7, [2.0, 1.0], 0.0, 0.0)
     assert (line["cov_local"], line["extent"]) == ([[0.0008, 1e-05], [1e-05, 1e-06]], [-2.0, 2.0])
     assert line["cov_independent"] == [[0.0004, 1e-05], [1e-05, 1e-06]]
-    assert line["sqrt_persistent"] == [[0.02, 0, 0], [0, 0, 0]]
+    assert (line["sqrt_persistent"], line["first_angle"]) == ([[0.02, 0, 0], [0, 0, 0]], 0.25)
     pole, cluster = found["circles"]
     covariances = {"cov": 5 * np.eye(3), "cov_independent": np.eye(3), "sqrt_persistent": 2 * np.eye(3)}
     assert pole == {"center": [1, 2], "radius": 0.25, "times_detected": 1} | {

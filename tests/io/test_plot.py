@@ -33,6 +33,7 @@ def some_map(lines: int = 6, circles: int = 4, size: float = 10.0) -> LineMap:
             angle=number(rng.uniform(-3, 3, lines)),
             cov_independent=number(root @ np.swapaxes(root, -1, -2) + np.eye(2) * 1e-5),
             sqrt_persistent=number(rng.normal(size=(lines, 2, 3)) * [[0.02], [0.01]]),
+            first_angle=number(np.zeros(lines)),
             extent=number(np.sort(rng.uniform(-2, 2, (lines, 2)))),
             var_extent=number(np.full((lines, 2), 1e-4)),
             times_detected=jnp.asarray(rng.integers(1, 40, lines), jnp.int32),
