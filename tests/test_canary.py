@@ -6,6 +6,7 @@ or is a near relative of one that does.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -15,6 +16,8 @@ import pytest
 
 from linemap_jax.core.propagation import apply, product, propagate, quadratic
 
+AS_USERS: Any = {"xla_backend_optimization_level": 3, "xla_cpu_use_fusion_emitters": True}
+"""How jax compiles unless told otherwise; the tests are."""
 ROWS = 40_000  # past the point where releases known to be wrong begin to be
 
 # Of one row and what the rows share; the operands, and the same for all rows at once in NumPy's notation. `v` and `w`
@@ -52,7 +55,7 @@ def test_jit_agrees_with_numpy(form: str, dtype: str, emitters: bool, size: int)
     function, operands, subscripts = FORMS[form]
     want = np.einsum(subscripts, *(given[name].astype(np.float64) for name in operands), optimize=True)
 
-    options: Any = {"xla_cpu_use_fusion_emitters": emitters}  # the package uses both
+    options: Any = AS_USERS | {"xla_cpu_use_fusion_emitters": emitters}  # the package uses both
     compiled = jax.jit(jax.vmap(function, (0, 0, 0, None, None)), compiler_options=options)
     got = compiled(*(given[name] for name in "vwjmc"))
 
@@ -66,7 +69,7 @@ def test_jit_agrees_with_numpy_reduced_over_all_rows(dtype: str):
     v = (np.arange(ROWS * 3).reshape(ROWS, 3) % 7).astype(dtype)
     m = np.array([[1, 2, 0], [0, 1, 1], [2, 0, 1]], dtype)
 
-    @jax.jit
+    @partial(jax.jit, compiler_options=AS_USERS)
     def total(m, v):
         return jnp.sum(jax.vmap(lambda row: jnp.sum(m @ row))(v))
 

@@ -12,8 +12,6 @@ ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 LARGEST = 700_000
 """Bytes of a notebook with its pictures: whoever clones the project pays for them."""
-COMPILE_SOONER = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
-"""In half of the time; a quick run hardly does anything else."""
 
 pytestmark = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 
@@ -23,7 +21,6 @@ def run_notebooks(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     more = {
         "LINEMAP_QUICK": "1",
         "PYTHONPATH": os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")])),
-        "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {COMPILE_SOONER}",
     }
     return subprocess.run(
         [sys.executable, ROOT / "scripts/run_notebooks.py", *arguments],

@@ -18,7 +18,7 @@ from linemap_jax.core.propagation import apply, inverse, product, safe_sqrt, squ
 from linemap_jax.core.runs import Runs
 from linemap_jax.core.sensor import Points
 from linemap_jax.core.settings import Jacobians, SensorNoise, Thresholds
-from linemap_jax.core.slots import neutral_where_free
+from linemap_jax.core.slots import directed, neutral_where_free
 from linemap_jax.core.state import Circles, Lines, Pose, squared
 
 MIN_FIT_POINTS = 5
@@ -344,6 +344,6 @@ def near_lines(circles: Circles, lines: Lines, thresholds: Thresholds) -> Bool[A
         beyond = along - jnp.clip(along, line.extent[0], line.extent[1])
         return across**2 + beyond**2
 
-    every = jax.vmap(jax.vmap(distance2, (None, 0)), (0, None))(circles.center, lines)
+    every = jax.vmap(jax.vmap(distance2, (None, 0)), (0, None))(circles.center, directed(lines))
     reach = thresholds.circle_line_distance + jnp.where(circles.fitted, circles.radius, 0)
     return circles.valid & jnp.any(lines.valid[None] & (every < reach[:, None] ** 2), -1)

@@ -30,7 +30,7 @@ from linemap_jax.core.settings import (
     Thresholds,
     persistence_of,
 )
-from linemap_jax.core.slots import choose, first_true, free_slots, neutral_where_free, put, take
+from linemap_jax.core.slots import choose, directed, first_true, free_slots, neutral_where_free, put, take
 from linemap_jax.core.state import (
     LEFT_OUT,
     NEW,
@@ -312,7 +312,7 @@ def _sweep(
         times = jnp.where(lines.targets >= 0, lines.model.times_detected[lines.targets], 0)
         swath = wiping.swath_of_scan(points, pose, line_of_point, found.lines, lines.own, times, thresholds)
         affected = jax.vmap(lambda line, slot: wiping.may_have_passed(line, slot, swath, thresholds))(
-            lines.model, slots
+            directed(lines.model), slots
         )
         model, wiped = wiping.wipe_lines(
             lines.model,

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from linemap_jax.core.frames import dot, wrap_angle
 from linemap_jax.core.propagation import inverse, quadratic
 from linemap_jax.core.settings import PoseError, Rules, Thresholds
-from linemap_jax.core.slots import least, take
+from linemap_jax.core.slots import directed, least, take
 from linemap_jax.core.state import Circles, Lines, pytree, squared
 
 OVERLAP_WEIGHT = 1e-3
@@ -127,7 +127,7 @@ def best_line(
         return jnp.where(counts, pair.nis + OVERLAP_WEIGHT * pair.gap, jnp.inf)
 
     by_model = jax.vmap(score, (None, 0))
-    scores = jax.vmap(by_model, (0, None))(new, model)
+    scores = jax.vmap(by_model, (0, None))(new, directed(model))
     slot, best = least(scores if among is None else jnp.where(among, scores, jnp.inf))
     nis = jax.vmap(lambda a, b: compare_lines(a, b, thresholds, pose_error).nis)(new, take(model, slot))
     return slot, jnp.where(jnp.isfinite(best), nis, jnp.inf)

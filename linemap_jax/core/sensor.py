@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from linemap_jax.core.frames import rotate, unit
 from linemap_jax.core.propagation import jacobian, propagate
 from linemap_jax.core.settings import Jacobians, Mount, SensorNoise
-from linemap_jax.core.slots import all_true
+from linemap_jax.core.slots import all_true, materialise
 from linemap_jax.core.state import Pose, Scan, pytree
 
 
@@ -116,9 +116,12 @@ def points_from_scan(scan: Scan, pose: Pose, mount: Mount, *, jacobians: Jacobia
             lambda m: point_from_measurement(here, m, at), lambda m: jac_point_measurement(here, m, at), jacobians
         )(s)
 
+    position = jax.vmap(lambda s: point_from_measurement(here, s, at))(measurement)
+    beam = unit(here[2] + at[2] + bearing)
+    position, beam, measurement = materialise((position, beam, measurement), jnp.any(valid))
     return Points(
-        position=jax.vmap(lambda s: point_from_measurement(here, s, at))(measurement),
-        beam=unit(here[2] + at[2] + bearing),
+        position=position,
+        beam=beam,
         range=measurement[:, 0],
         turn=jnp.abs(bearing - jnp.concatenate([bearing[:1], bearing[:-1]])),
         valid=valid,

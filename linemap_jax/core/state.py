@@ -140,7 +140,8 @@ class Lines:
     @property
     def tangent(self) -> Float[Array, "K 2"]:
         """Unit tangents, from begin to end. Shape `[K, 2]`."""
-        return jnp.stack([-jnp.sin(self.angle), jnp.cos(self.angle)], -1)
+        normal = self.normal
+        return jnp.stack([-normal[..., 1], normal[..., 0]], -1)
 
     @property
     def begin(self) -> Float[Array, "K 2"]:
@@ -160,6 +161,18 @@ class Lines:
     def point_at(self, along: Float[Array, " K"]) -> Float[Array, "K 2"]:
         """The points that lie `along` metres from the foot of the anchor. Shape `[K, 2]`."""
         return self.anchor + self.offset[..., None] * self.normal + along[..., None] * self.tangent
+
+
+@pytree
+class DirectedLines(Lines):
+    """Lines whose normals stand ready, for whoever holds many against many; see `slots.directed`."""
+
+    unit_normal: Float[Array, "K 2"]
+
+    @property
+    def normal(self) -> Float[Array, "K 2"]:
+        """Unit normals. Shape `[K, 2]`."""
+        return self.unit_normal
 
 
 @pytree
