@@ -60,9 +60,7 @@ def assert_close(a: Any, b: Any) -> None:
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-11), a, b)
 
 
-# As in `build`: these options compile in half the time.
-quick = partial(jax.jit, compiler_options={"xla_cpu_use_fusion_emitters": False})
-update_one = quick(partial(update, capacity=SCAN))
+update_one = jax.jit(partial(update, capacity=SCAN))
 
 
 @pytest.fixture(scope="module")
@@ -147,7 +145,7 @@ def test_vmap_over_maps_and_scans_is_each_alone(drive: Any, by_loop: Any) -> Non
     which = (2, 5, 8)
     maps = jax.tree.map(lambda *x: jnp.stack(x), *(by_loop[0][t] for t in which))
     scans, poses = at(drive[0], jnp.array(which)), at(drive[1], jnp.array(which))
-    together, reports = quick(jax.vmap(partial(update, capacity=SCAN)))(maps, scans, poses)
+    together, reports = jax.jit(jax.vmap(partial(update, capacity=SCAN)))(maps, scans, poses)
     for i, t in enumerate(which):
         assert_close(at(together, i), by_loop[0][t + 1])
         assert_close(at(reports, i), by_loop[1][t])

@@ -7,17 +7,15 @@ or is a near relative of one that does.
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import AS_USERS
 
 from linemap_jax.core.propagation import apply, product, propagate, quadratic
 
-AS_USERS: Any = {"xla_backend_optimization_level": 3, "xla_cpu_use_fusion_emitters": True}
-"""How jax compiles unless told otherwise; the tests are."""
 ROWS = 40_000  # past the point where releases known to be wrong begin to be
 
 # Of one row and what the rows share; the operands, and the same for all rows at once in NumPy's notation. `v` and `w`
@@ -55,7 +53,7 @@ def test_jit_agrees_with_numpy(form: str, dtype: str, emitters: bool, size: int)
     function, operands, subscripts = FORMS[form]
     want = np.einsum(subscripts, *(given[name].astype(np.float64) for name in operands), optimize=True)
 
-    options: Any = AS_USERS | {"xla_cpu_use_fusion_emitters": emitters}  # the package uses both
+    options = AS_USERS | {"xla_cpu_use_fusion_emitters": emitters}  # the package uses both
     compiled = jax.jit(jax.vmap(function, (0, 0, 0, None, None)), compiler_options=options)
     got = compiled(*(given[name] for name in "vwjmc"))
 

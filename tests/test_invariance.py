@@ -185,8 +185,7 @@ def test_padding_and_capacity_do_not_matter() -> None:
     )
 
 
-# As in `build`: these options compile in half the time.
-@partial(jax.jit, compiler_options={"xla_cpu_use_fusion_emitters": False})
+@jax.jit
 def map_of(line_map: LineMap, scans: Scan, poses: Pose) -> tuple[LineMap, Any]:
     return jax.lax.scan(lambda m, x: update(m, *x, capacity=SCAN), line_map, (scans, poses))
 

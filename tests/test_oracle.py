@@ -8,6 +8,7 @@ import jax
 import numpy as np
 import oracle
 import pytest
+from compiling import as_built
 from real_logs import LOGS, one, scans_of
 
 from linemap_jax import Capacity, Mount, SensorNoise, build, empty_map, extract, preset, update
@@ -40,12 +41,6 @@ def oracle_options(options: dict[str, Any]) -> dict[str, Any]:
 def fields(scan: Any) -> tuple[Any, ...]:
     """A scan as the oracle takes it."""
     return scan.ranges, scan.bearings, scan.valid, float(scan.spacing)
-
-
-# As in `build`, whatever the flags that the tests run with.
-as_built = partial(
-    jax.jit, compiler_options={"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 3}
-)
 
 
 @partial(as_built, static_argnames="name")

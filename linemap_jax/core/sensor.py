@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from linemap_jax.core.frames import rotate, unit
 from linemap_jax.core.propagation import jacobian, propagate
 from linemap_jax.core.settings import Jacobians, Mount, SensorNoise
-from linemap_jax.core.slots import all_true, materialise
+from linemap_jax.core.slots import all_true, computed_once
 from linemap_jax.core.state import Pose, Scan, pytree
 
 
@@ -105,8 +105,13 @@ def points_from_scan(scan: Scan, pose: Pose, mount: Mount, *, jacobians: Jacobia
     n = scan.ranges.shape[0]
     order = all_true(scan.valid, n)
     valid = order < n
-    measurement = jnp.where(valid[:, None], jnp.stack([scan.ranges, scan.bearings], -1)[order], 0)
-    bearing = measurement[:, 1]
+
+    def of_beam(index: Int[Array, " M"]) -> tuple[Array, Array, Array]:
+        range_, bearing = (jnp.where(index < n, x[index], 0) for x in (scan.ranges, scan.bearings))
+        return range_, bearing, unit(here[2] + at[2] + bearing)
+
+    range_, bearing, beam = computed_once(of_beam, order)
+    measurement = jnp.stack([range_, bearing], -1)
 
     def by_pose(x: Array, s: Array) -> Array:
         return jacobian(lambda p: point_from_measurement(p, s, at), lambda p: jac_point_pose(p, s, at), jacobians)(x)
@@ -116,13 +121,10 @@ def points_from_scan(scan: Scan, pose: Pose, mount: Mount, *, jacobians: Jacobia
             lambda m: point_from_measurement(here, m, at), lambda m: jac_point_measurement(here, m, at), jacobians
         )(s)
 
-    position = jax.vmap(lambda s: point_from_measurement(here, s, at))(measurement)
-    beam = unit(here[2] + at[2] + bearing)
-    position, beam, measurement = materialise((position, beam, measurement), jnp.any(valid))
     return Points(
-        position=position,
+        position=jax.vmap(lambda s: point_from_measurement(here, s, at))(measurement),
         beam=beam,
-        range=measurement[:, 0],
+        range=range_,
         turn=jnp.abs(bearing - jnp.concatenate([bearing[:1], bearing[:-1]])),
         valid=valid,
         index=order,

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import as_built
 
 from linemap_jax.core.fusion import Errors, at_first_angle, combine, forget, fuse_circles, fuse_lines
 from linemap_jax.core.matching import CircleMatches
@@ -236,7 +237,7 @@ def test_ten_thousand_fusions_in_float32(pose_error: PoseError, root: np.ndarray
             model = fuse(model, seen, YES, pose_error=pose_error)
             return model, (model.cov[0], jnp.stack([model.offset[0], model.angle[0]]))
 
-        model, (covs, means) = jax.jit(partial(jax.lax.scan, step))(start, noise)
+        model, (covs, means) = as_built(partial(jax.lax.scan, step))(start, noise)
         return model, np.asarray(covs), np.asarray(means)
 
     model, covs, means = run(*in_float32((start, piece)))

@@ -38,8 +38,7 @@ def drive(errors: np.ndarray) -> tuple[Scan, Pose]:
     return jax.tree.map(lambda *x: jnp.stack(x), *scans), Pose(mean=jnp.asarray(true + errors), cov=jnp.asarray(cov))
 
 
-# As in `build`: these options compile in half the time.
-@partial(jax.jit, static_argnames="pose_error", compiler_options={"xla_cpu_use_fusion_emitters": False})
+@partial(jax.jit, static_argnames="pose_error")
 def maps_of(line_map: LineMap, scans: Scan, poses: Pose, pose_error: PoseError) -> tuple[LineMap, Report]:
     """The map after each scan, and the reports."""
 

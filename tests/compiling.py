@@ -1,0 +1,13 @@
+"""How programs are compiled where a test cares; else scripts/test sets what compiles soonest."""
+
+from functools import partial
+from typing import Any
+
+import jax
+
+AS_USERS: Any = {"xla_backend_optimization_level": 3, "xla_cpu_use_fusion_emitters": True}
+"""As jax does it unless told otherwise."""
+AS_BUILD: Any = AS_USERS | {"xla_cpu_use_fusion_emitters": False}
+"""As `linemap_jax.build` does it."""
+
+as_built = partial(jax.jit, compiler_options=AS_BUILD)
