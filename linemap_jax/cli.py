@@ -728,7 +728,7 @@ def _trials(command: Trials) -> int:
     from linemap_jax.io.table import ResultsTable
     from linemap_jax.lab.batch import run_chunks
     from linemap_jax.lab.scanners import PRESETS
-    from linemap_jax.lab.trials import Conditions, Trial, columns_of, summary, sweep, trial
+    from linemap_jax.lab.trials import Conditions, Trial, columns_of, recommend, summary, sweep, trial
 
     thresholds, noise = options.pop("thresholds"), options.pop("noise")
     conditions = Conditions(
@@ -781,11 +781,20 @@ def _trials(command: Trials) -> int:
     results = table.read()
     speed = {"seconds": seconds, "drives_per_second": (total - done) / seconds}
     if command.sweep:
+        of_variants = [{name: column[i :: len(varied)] for name, column in results.items()} for i in range(len(varied))]
+        advice = recommend(varied, of_variants)
+        costs, differences, errors = (
+            np.concatenate([getattr(one, name) for one in advice]).tolist()
+            for name in ("costs", "differences", "errors")
+        )
         scores = [
-            {"threshold": name, "value": value, **summary({k: v[i :: len(varied)] for k, v in results.items()})}
+            {"threshold": name, "value": value, "cost": costs[i], "difference": differences[i], "error": errors[i]}
+            | summary(of_variants[i])
             for i, (name, value) in enumerate(varied)
         ]
-        print(json.dumps({"variants": scores, **speed}, indent=2) if command.json else _sweep_in_words(scores))
+        recommended = {one.threshold: one.value for one in advice}
+        document = {"variants": scores, "recommended": recommended, **speed}
+        print(json.dumps(document, indent=2) if command.json else _sweep_in_words(scores, recommended))
     else:
         score = summary(results) | speed
         print(json.dumps(score, indent=2) if command.json else _trials_in_words(score))
@@ -794,12 +803,15 @@ def _trials(command: Trials) -> int:
     return 0
 
 
-def _sweep_in_words(scores: list[dict[str, Any]]) -> str:
-    names = ("precision", "recall", "duplicates", "false_matches", "missed_matches", "gone", "noticed")
+def _sweep_in_words(scores: list[dict[str, Any]], recommended: dict[str, float]) -> str:
+    names = ("cost", "precision", "recall", "duplicates", "false_matches", "missed_matches", "gone", "noticed")
     lines = [f"{'threshold':22s} {'value':>8s} " + " ".join(f"{name:>14s}" for name in names)]
     for score in scores:
         cells = ["-" if score[name] is None else f"{score[name]:.2%}" for name in names]
-        lines.append(f"{score['threshold']:22s} {score['value']:8.4g} " + " ".join(f"{cell:>14s}" for cell in cells))
+        mark = " <-" if score["value"] == recommended[score["threshold"]] else ""
+        cells = " ".join(f"{cell:>14s}" for cell in cells)
+        lines.append(f"{score['threshold']:22s} {score['value']:8.4g} {cells}{mark}")
+    lines.append("cost: the sum of the shares of all mistakes; <- recommended: the least cost if that is sure")
     return "\n".join(lines)
 
 

@@ -4,6 +4,8 @@ Lines are compared at the anchor of the new line: the mean of the other line is 
 first order. (rho, theta) and (-rho, theta + pi) are one line, and differences of angles are wrapped.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -32,6 +34,7 @@ class LineComparison:
     geometric: Bool[Array, ""]  # is collinear, and passes the gap gate
 
 
+@partial(jax.jit, static_argnames="pose_error")  # so that it is traced once, not once for each of its seven uses
 def compare_lines(new: Lines, model: Lines, thresholds: Thresholds, pose_error: PoseError) -> LineComparison:
     """Hold one new line against one line of the map: section 5.1.1.
 
@@ -122,15 +125,15 @@ def best_line(
     """
 
     def score(a: Lines, b: Lines) -> Float[Array, ""]:
-        pair = compare_lines(a, b, thresholds, pose_error)
+        pair: LineComparison = compare_lines(a, b, thresholds, pose_error)
         counts = pair.geometric & (pair.gap < 0) if overlapping else pair.geometric
         return jnp.where(counts, pair.nis + OVERLAP_WEIGHT * pair.gap, jnp.inf)
 
     by_model = jax.vmap(score, (None, 0))
     scores = jax.vmap(by_model, (0, None))(new, directed(model))
     slot, best = least(scores if among is None else jnp.where(among, scores, jnp.inf))
-    nis = jax.vmap(lambda a, b: compare_lines(a, b, thresholds, pose_error).nis)(new, take(model, slot))
-    return slot, jnp.where(jnp.isfinite(best), nis, jnp.inf)
+    chosen: LineComparison = jax.vmap(lambda a, b: compare_lines(a, b, thresholds, pose_error))(new, take(model, slot))
+    return slot, jnp.where(jnp.isfinite(best), chosen.nis, jnp.inf)
 
 
 def normal_variance(cov: Float[Array, "2 2"], along: Float[Array, "*s"]) -> Float[Array, "*s"]:

@@ -28,7 +28,7 @@ from linemap_jax.core.extract import extract
 from linemap_jax.core.frames import dot, unit, wrap_angle
 from linemap_jax.core.fusion import at_first_angle, forget, fuse_lines
 from linemap_jax.core.lines import MIN_POINTS, measure_lines
-from linemap_jax.core.matching import compare_lines
+from linemap_jax.core.matching import LineComparison, compare_lines
 from linemap_jax.core.propagation import inverse, quadratic
 from linemap_jax.core.runs import Runs
 from linemap_jax.core.sensor import points_from_scan
@@ -233,7 +233,7 @@ def _improve(
     persistence = persistence_of(model.pose_error, model.persistence)
     before = forget(before, jnp.square(persistence.correlation))
     before = jax.tree.map(lambda x, y: jnp.where(has_prior, x, y), before, line)
-    nis = compare_lines(forget(line, persistence.share), before, Thresholds(), model.pose_error).nis
+    pair: LineComparison = compare_lines(forget(line, persistence.share), before, Thresholds(), model.pose_error)
     before, line = jax.tree.map(lambda x: x[None], (before, line))
     after = fuse_lines(
         before,
@@ -246,7 +246,7 @@ def _improve(
         persistence.share,
     )
     after = jax.tree.map(lambda x, y: jnp.where(seen, x, y)[0], after, before)
-    return after, jnp.where(has_prior & seen, nis, 0)
+    return after, jnp.where(has_prior & seen, pair.nis, 0)
 
 
 def _visible_wall(

@@ -5,7 +5,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -251,3 +251,77 @@ def summary(columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
         "noticed": share("noticed", "appeared"),
         "full": int(total["full"]),
     }
+
+
+SURE_SIGMAS = 3.0
+"""A value of a threshold is recommended in place of the present one if it is better by so many standard errors."""
+
+
+def mistakes(columns: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """What went wrong in each drive, by kind, and out of how much.
+
+    The kinds are line on no wall, wall without a line, wall that is held twice, match that is false, match that was
+    missed, object that has vanished and is still in the map after `SCANS_TO_NOTICE` scans, and one that has come and is
+    not. Both shapes `[R, 7]`.
+    """
+    c = {name: np.asarray(values, float) for name, values in columns.items()}
+    matches = c["true_matches"] + c["false_matches"] + c["missed_matches"]
+    kinds = [
+        (c["line_length"] - c["line_length_on_walls"], c["line_length"]),
+        (c["wall_seen"] - c["wall_held"], c["wall_seen"]),
+        (c["duplicates"], c["walls"]),
+        (c["false_matches"], matches),
+        (c["missed_matches"], matches),
+        (c["vanished"] - c["gone"], c["vanished"]),
+        (c["appeared"] - c["noticed"], c["appeared"]),
+    ]
+    wrong, whole = (np.stack(part, -1) for part in zip(*kinds, strict=True))
+    return wrong, whole
+
+
+class Recommendation(NamedTuple):
+    """What a sweep says of one threshold."""
+
+    threshold: str
+    values: np.ndarray  # [F], the present one times `FACTORS`
+    costs: np.ndarray  # [F], sum of the shares of all kinds of mistakes; from 0 to 7
+    differences: np.ndarray  # [F], of the cost from that of the present value
+    errors: np.ndarray  # [F], standard errors of these
+    value: float  # that is recommended
+
+
+def recommend(
+    variants: Sequence[tuple[str, float]], columns: Sequence[Mapping[str, np.ndarray]]
+) -> list[Recommendation]:
+    """For each threshold of a sweep the value that costs least, where that is sure; else the present one.
+
+    Args:
+      variants: name and value of what was varied, as `sweep` gives them.
+      columns: for each of them the results of the same drives.
+
+    Returns:
+      For each threshold what the sweep says. Standard errors are those of the jackknife over the drives, which all
+      variants have in common.
+    """
+    counts = [mistakes(of_variant) for of_variant in columns]
+    found = []
+    present = FACTORS.index(1.0)
+    for first in range(0, len(variants), len(FACTORS)):
+        here = slice(first, first + len(FACTORS))
+        wrong, whole = (np.stack([pair[i] for pair in counts[here]]) for i in (0, 1))
+        costs = _cost(wrong.sum(1), whole.sum(1))
+        without = _cost(wrong.sum(1, keepdims=True) - wrong, whole.sum(1, keepdims=True) - whole)
+        without = without - without[present]
+        drives = without.shape[1]
+        errors = np.sqrt((drives - 1) * np.var(without, 1))
+        differences = costs - costs[present]
+        better = differences < -SURE_SIGMAS * errors
+        best = int(np.argmin(np.where(better, costs, np.inf))) if better.any() else present
+        values = np.array([value for _, value in variants[here]])
+        found.append(Recommendation(variants[first][0], values, costs, differences, errors, float(values[best])))
+    return found
+
+
+def _cost(wrong: np.ndarray, whole: np.ndarray) -> np.ndarray:
+    """The sum of the shares; that of nothing is zero."""
+    return np.sum(np.divide(wrong, whole, out=np.zeros_like(wrong), where=whole > 0), -1)

@@ -7,7 +7,8 @@ import os
 import sys
 
 output, devices, *host = sys.argv[1:]
-os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={devices}"
+# Without other flags: compiled with no optimisation, programs for one device and for several round differently.
+os.environ["XLA_FLAGS"] = f"--xla_force_host_platform_device_count={devices}"
 
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402

@@ -15,7 +15,7 @@ from linemap_jax.lab import generators
 from linemap_jax.lab.batch import run_batch
 from linemap_jax.lab.scanners import Scanner, pls, simulate_scan, sweep
 from linemap_jax.lab.scoring import judge_matches
-from linemap_jax.lab.trials import Conditions, Trial, columns_of, summary, trial
+from linemap_jax.lab.trials import FACTORS, Conditions, Outcome, Trial, columns_of, mistakes, recommend, summary, trial
 from linemap_jax.lab.world import World
 
 SCANS = 16
@@ -106,3 +106,35 @@ def test_matches_are_judged_by_the_walls():
     assert false > 0
     assert true + false == 5
     assert missed == 0
+
+
+def drives(rng: np.random.Generator, count: int, held: float) -> dict[str, np.ndarray]:
+    """Results of made-up drives that have seen 20 m of wall each, and hold about a share of that."""
+    columns = {field.name: np.zeros(count) for field in dataclasses.fields(Outcome)}
+    return columns | {"wall_seen": np.full(count, 20.0), "wall_held": 20 * rng.normal(held, 0.02, count)}
+
+
+def test_mistakes_are_shares_of_what_there_was():
+    columns = drives(np.random.default_rng(0), 3, 0.9) | {"walls": np.full(3, 4.0), "duplicates": np.array([0, 1, 2.0])}
+    wrong, whole = mistakes(columns)
+    assert wrong.shape == whole.shape == (3, 7)
+    np.testing.assert_array_equal(wrong[:, 2] / whole[:, 2], [0, 0.25, 0.5])
+    np.testing.assert_allclose(wrong[:, 1], 20 - columns["wall_held"])
+    assert not whole[:, [0, 3, 4, 5, 6]].any()
+
+
+def test_a_value_is_recommended_where_it_is_surely_better():
+    rng = np.random.default_rng(1)
+    present = FACTORS.index(1.0)
+    variants = [(name, 2.0 * factor) for name in ("match_gap", "match_nis") for factor in FACTORS]
+    much, little = np.full(len(FACTORS), 0.9), np.full(len(FACTORS), 0.9)
+    much[present + 1], much[present + 2], little[present + 1] = 0.95, 0.98, 0.903
+    columns = [drives(rng, 40, held) for held in (*much, *little)]
+    first, second = recommend(variants, columns)
+    assert (first.threshold, first.value) == ("match_gap", 2 * FACTORS[present + 2])
+    assert (second.threshold, second.value) == ("match_nis", 2.0)
+    np.testing.assert_allclose(first.costs, 1 - much, atol=0.02)
+    # The standard error of a difference of two means, each of 40 drives
+    others = np.arange(len(FACTORS)) != present
+    np.testing.assert_allclose(first.errors[others], 0.02 * np.sqrt(2 / 40), rtol=0.3)
+    assert first.differences[present] == first.errors[present] == 0
