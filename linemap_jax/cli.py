@@ -244,7 +244,7 @@ CHUNK_RUNS = 256
 SCAN_SECONDS = 0.2
 """Between two simulated scans."""
 
-START_CAPACITY = (512, 256)
+START_CAPACITY = (1024, 512)
 """Slots for lines and circles to begin with. To grow costs a compilation, and most buildings fit into these."""
 
 COUNTS = ("added", "fused", "merged", "trimmed", "split", "deleted")

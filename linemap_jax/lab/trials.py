@@ -264,7 +264,7 @@ def mistakes(columns: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]
     missed, object that has vanished and is still in the map after `SCANS_TO_NOTICE` scans, and one that has come and is
     not. Both shapes `[R, 7]`.
     """
-    c = {name: np.asarray(values, float) for name, values in columns.items()}
+    c = {field.name: np.asarray(columns[field.name], float) for field in dataclasses.fields(Outcome)}
     matches = c["true_matches"] + c["false_matches"] + c["missed_matches"]
     kinds = [
         (c["line_length"] - c["line_length_on_walls"], c["line_length"]),
