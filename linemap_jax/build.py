@@ -165,8 +165,8 @@ def _grow_map(line_map: LineMap, full: Status) -> LineMap:
     """Twice the room for lines and circles where either ran out: the other soon would, and each growth is compiled."""
     if not full & (Status.MAP_LINES_FULL | Status.MAP_CIRCLES_FULL):
         return line_map
-    lines, circles = (resize(slots, 2 * slots.valid.shape[0]) for slots in (line_map.lines, line_map.circles))
-    return LineMap(lines=lines, circles=circles)
+    lines, circles = line_map.lines, line_map.circles
+    return LineMap(lines=resize(lines, 2 * lines.valid.shape[0]), circles=resize(circles, 2 * circles.valid.shape[0]))
 
 
 def _grow_scan(capacity: Capacity, full: Status) -> Capacity:
