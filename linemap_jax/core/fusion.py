@@ -66,21 +66,21 @@ def combine(old: Errors, new: Errors, pose_error: PoseError) -> tuple[Float[Arra
     if pose_error == "persistent":
         c_new = c_new + JACOBIAN_ERROR**2 * squared(a_new)
     times = old.times_detected + new.times_detected
+    difference = a_new - a_old
     if pose_error == "unknown":
         # As floats of the right kind: the quotient of two int32 is a float32.
         w = (old.times_detected.astype(c_old.dtype) / times.astype(c_old.dtype))[..., None, None]
         before = c_old + squared(a_old) / w
         innovation = before + c_new + squared(a_new) / (1 - w)
     else:
-        difference = a_new - a_old
         before = c_old - product(a_old, jnp.swapaxes(difference, -1, -2))
         innovation = c_old + c_new + squared(difference)
     unit = inverse(symmetric(innovation))
     gain = product(before, unit)
     keep = jnp.broadcast_to(jnp.eye(gain.shape[-1], dtype=gain.dtype), gain.shape) - gain
     independent = propagate(keep, c_old) + propagate(gain, c_new)
-    a_old, a_new = product(keep, a_old), product(gain, a_new)
     if pose_error == "unknown":
+        a_old, a_new = product(keep, a_old), product(gain, a_new)
         # 1 / w = 1 + b / a and 1 / (1 - w) = 1 + a / b, with a and b the sizes of both terms
         a, b = (_size(squared(x), unit) for x in (a_old, a_new))
         some = (a > 0) & (b > 0)
@@ -90,7 +90,8 @@ def combine(old: Errors, new: Errors, pose_error: PoseError) -> tuple[Float[Arra
         root = square_root(bound)
         persistent = jnp.zeros_like(a_old).at[..., : root.shape[-1]].set(root)
     else:
-        persistent = a_old + a_new
+        # (I - K) A_old + K A_new, in the form that keeps A to the last digit where both views share all of it
+        persistent = a_old + product(gain, difference)
     return gain, Errors(cov_independent=independent, sqrt_persistent=persistent, times_detected=times)
 
 
