@@ -5,7 +5,7 @@ capacity runs full the chunk is done again with twice the room: no primitive is 
 """
 
 import dataclasses
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from typing import Any
 
@@ -20,13 +20,14 @@ from linemap_jax.core.settings import SCAN_CAPACITY, Capacity
 from linemap_jax.core.slots import resize
 from linemap_jax.core.state import LEFT_OUT, Extraction, LineMap, Pose, Report, Scan, Status, pad_stack
 
-_jit = partial(
-    jax.jit,
-    static_argnames=("pose_error", "capacity", "rules", "segmentation", "covariance", "jacobians"),
-    # XLA's older loop emitters compile the many small kernels of a map step in half the time, and on a CPU they run
-    # nearly twice as fast (jax 0.8.3). Other devices do not look at this option.
-    compiler_options={"xla_cpu_use_fusion_emitters": False},
-)
+STATIC = ("pose_error", "capacity", "rules", "segmentation", "covariance", "jacobians")
+"""Options of `update` that decide which program it is."""
+
+COMPILER_OPTIONS = {"xla_cpu_use_fusion_emitters": False}
+"""XLA's older loop emitters compile the many small kernels of a map step in half the time, and on a CPU they run nearly
+twice as fast (jax 0.8.3). Other devices do not look at this option."""
+
+_jit = partial(jax.jit, static_argnames=STATIC, compiler_options=COMPILER_OPTIONS)
 
 CHUNK = 64
 """Scans in one jitted call. A compromise: the map is looked at once a chunk, and a chunk may have to be repeated."""
@@ -80,6 +81,7 @@ def build_chunks(
     map_capacity: Capacity = Capacity(),
     capacity: Capacity = SCAN_CAPACITY,
     chunk: int = CHUNK,
+    run: Callable[..., tuple[LineMap, Report]] | None = None,
     **options: Any,
 ) -> Iterator[tuple[LineMap, Report]]:
     """Build a map from a log that comes piece by piece: memory does not grow with its length.
@@ -90,6 +92,7 @@ def build_chunks(
       map_capacity: as for `build`.
       capacity: as for `build`.
       chunk: as for `build`.
+      run: `update_chunk`, made ready to run; jitted unless given.
       **options: the remaining keyword arguments of `update`.
 
     Yields:
@@ -109,7 +112,7 @@ def build_chunks(
         active = jnp.asarray(np.arange(chunk) < count)
         scans, poses = pad_stack(scans, chunk), pad_stack(poses, chunk)
         while True:
-            after, report = _run(line_map, scans, poses, active, capacity=capacity, **options)
+            after, report = (run or _run)(line_map, scans, poses, active, capacity=capacity, **options)
             full = Status(int(np.bitwise_or.reduce(np.asarray(report.status))))
             if not full & ~Status.POSE_NOT_FINITE:
                 break
@@ -149,16 +152,31 @@ def _extract(scans: Scan, **options: Any) -> Extraction:
     return jax.lax.map(lambda scan: extract(scan, here, **options), scans)
 
 
-@_jit
-def _run(
+def update_chunk(
     line_map: LineMap, scans: Scan, poses: Pose, active: Bool[Array, " T"], **options: Any
 ) -> tuple[LineMap, Report]:
+    """Update a map by a chunk of scans, one after the other: what `build` runs over and over.
+
+    Args:
+      line_map: the map.
+      scans: `T` scans, stacked.
+      poses: `T` poses of the robot, stacked.
+      active: False for scans that only fill up the chunk. Shape `[T]`.
+      **options: the remaining arguments of `update`.
+
+    Returns:
+      The map, and the reports of all scans, stacked `[T]`.
+    """
+
     def step(line_map: LineMap, x: tuple[Scan, Pose, Array]) -> tuple[LineMap, Report]:
         scan, pose, is_active = x
         scan = dataclasses.replace(scan, valid=scan.valid & is_active)
         return update(line_map, scan, pose, **options)
 
     return jax.lax.scan(step, line_map, (scans, poses, active))
+
+
+_run = _jit(update_chunk)
 
 
 def _grow_map(line_map: LineMap, full: Status) -> LineMap:

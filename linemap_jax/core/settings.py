@@ -6,12 +6,11 @@ of its thresholds (30 cm, and 5 in Eq. (22)); the other values of `paper` are ou
 """
 
 import dataclasses
-from typing import Any, Literal, NamedTuple, dataclass_transform
+from typing import Any, Literal, NamedTuple
 
-import chex
 from jaxtyping import Array, Float
 
-from linemap_jax.core.state import pytree
+from linemap_jax.core.state import positional_pytree, pytree
 
 Number = float | Float[Array, ""]
 Segmentation = Literal["incremental"]
@@ -85,12 +84,7 @@ class SensorNoise:
     """Of a bearing, rad."""
 
 
-@dataclass_transform(frozen_default=True)
-def _positional(cls: type) -> Any:
-    return chex.dataclass(frozen=True, mappable_dataclass=False)(cls)
-
-
-@_positional
+@positional_pytree
 class Mount:
     """Where the scanner sits on the robot: its pose in the robot's frame, Eq. (2)."""
 

@@ -5,19 +5,38 @@ Capacities come from shapes, never from a field. Units are metres and radians, a
 """
 
 import enum
+import json
 from typing import Any, TypeVar, dataclass_transform
 
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import export
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
 def pytree(cls: type) -> Any:
     """Register a class as a frozen, keyword-only dataclass that is a pytree of its fields."""
-    return chex.dataclass(frozen=True, kw_only=True, mappable_dataclass=False)(cls)
+    return _exportable(chex.dataclass(frozen=True, kw_only=True, mappable_dataclass=False)(cls))
+
+
+@dataclass_transform(frozen_default=True)
+def positional_pytree(cls: type) -> Any:
+    """The same, and its fields may be given by position."""
+    return _exportable(chex.dataclass(frozen=True, mappable_dataclass=False)(cls))
+
+
+def _exportable(cls: type) -> type:
+    """Let `jax.export` write down programs over the class; beside the fields, chex keeps their names."""
+    export.register_pytree_node_serialization(
+        cls,
+        serialized_name=f"{cls.__module__}.{cls.__qualname__}",
+        serialize_auxdata=lambda names: json.dumps(names).encode(),
+        deserialize_auxdata=lambda names: tuple(json.loads(names)),
+    )
+    return cls
 
 
 class Status(enum.IntFlag):
