@@ -14,7 +14,9 @@ import jax
 import numpy as np
 import pytest
 
-from linemap_jax import cli
+from linemap_jax.cli import main
+from linemap_jax.cli.build import Build
+from linemap_jax.cli.extract import Extract
 
 BEAMS = 181  # one number in the whole file: each other number would be compiled anew
 SCANS = 10
@@ -85,7 +87,7 @@ def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str
     def run(*args: Any) -> tuple[int, str, str]:
         capsys.readouterr()
         try:
-            status = cli.main([str(arg) for arg in args])
+            status = main([str(arg) for arg in args])
         except SystemExit as stop:  # of the parser
             status = int(stop.code or 0)
         return status, *capsys.readouterr()
@@ -233,7 +235,7 @@ def test_the_paper_preset_in_float64_with_two_rules_switched(run, log, tmp_path)
 
 
 def test_all_options_of_the_contract_are_there():
-    given = {name.replace("_", "-") for kind in (cli.Build, cli.Extract) for name in kind.__dataclass_fields__}
+    given = {name.replace("_", "-") for kind in (Build, Extract) for name in kind.__dataclass_fields__}
     assert {
         *("preset", "range-sigma", "bearing-sigma", "pose-sigma", "range-min", "range-max", "laser-offset"),
         *("covariance", "jacobians", "segmentation", "every", "config", "dtype", "strict", "overwrite", "quiet"),

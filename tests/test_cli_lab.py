@@ -14,7 +14,9 @@ import pyarrow.parquet as pq
 import pytest
 import shapely
 
-from linemap_jax import cli
+from linemap_jax.cli import main, trials
+from linemap_jax.cli.options import MOST_SCANS
+from linemap_jax.cli.worlds import WorldKind, made_world
 from linemap_jax.core.mapping import empty_map
 from linemap_jax.core.settings import Capacity
 from linemap_jax.core.state import LineMap
@@ -53,9 +55,9 @@ def world_file(path: Path, *, room: Any = ROOM, box: Any = BOX, way: Any = PATH)
 
 
 @pytest.fixture(autouse=True)
-def _without_a_cache(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The command line would set up jax for its process."""
-    monkeypatch.setattr(cli, "_keep_compilations", lambda: None)
+def _without_a_cache(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> None:
+    """The command line would set up jax for its process, but leaves it as it is where the user has said."""
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path_factory.getbasetemp() / "cache"))
     assert jax.config.read("jax_enable_x64")
 
 
@@ -65,7 +67,7 @@ def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str
 
     def run(*args: Any) -> tuple[int, str, str]:
         capsys.readouterr()
-        status = cli.main([str(arg) for arg in args])
+        status = main([str(arg) for arg in args])
         out, err = capsys.readouterr()
         return status, out, err
 
@@ -94,9 +96,9 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     world = world_file(folder / "my.geojson")
     options = "--scans", SCANS, "--scanner", "rplidar_a1", "--pose-sigma", *SIGMA, "--pose-correlation", 1, "--seed", 5
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cli, "_keep_compilations", lambda: None)
+        patch.setenv("JAX_COMPILATION_CACHE_DIR", str(folder / "cache"))
         args = "simulate", "--world", world, *options, "-o", folder / "out", "--quiet"
-        assert cli.main([str(arg) for arg in args]) == 0
+        assert main([str(arg) for arg in args]) == 0
     return folder / "out"
 
 
@@ -158,10 +160,9 @@ def test_the_same_seed_gives_the_same_files_and_another_one_does_not(run, drive,
         assert same == is_same
 
 
-@pytest.mark.parametrize("kind", get_args(cli.Simulate.__dataclass_fields__["kind"].type))
+@pytest.mark.parametrize("kind", get_args(WorldKind))
 def test_each_kind_of_world_has_a_path(kind: Any) -> None:
-    command = cli.Simulate(output=Path("x"), kind=kind)
-    world = jax.eval_shape(lambda key: cli._made_world(command, key), jax.random.key(0))
+    world = jax.eval_shape(lambda key: made_world(kind, key, scans=300), jax.random.key(0))
     assert world.path.shape[0] > 1
     assert world.segments.valid.shape[0] >= 4
 
@@ -326,8 +327,8 @@ def bad_world(folder: Path) -> Path:
 
 @pytest.fixture
 def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cli, "BATCH_RUNS", 2)
-    monkeypatch.setattr(cli, "CHUNK_RUNS", 2)
+    monkeypatch.setattr(trials, "BATCH_RUNS", 2)
+    monkeypatch.setattr(trials, "CHUNK_RUNS", 2)
 
 
 @pytest.mark.usefixtures("small_chunks")
@@ -359,7 +360,7 @@ def test_trials_that_were_stopped_go_on_with_the_same_result(run, tmp_path: Path
 def test_trials_that_make_no_sense_are_refused(refuse, tmp_path: Path) -> None:
     out = "-o", tmp_path / "out"
     assert refuse("trials", *out, "--runs", 0) == "--runs must be from 1 to 100000000, not 0"
-    assert refuse("trials", *out, "--scans", 0) == f"--scans must be from 1 to {cli.MOST_SCANS}, not 0"
+    assert refuse("trials", *out, "--scans", 0) == f"--scans must be from 1 to {MOST_SCANS}, not 0"
     assert "1000 devices was asked for" in refuse("trials", *out, "--devices", 1000)
     assert refuse("trials", *out, "--config", tmp_path / "none.toml").startswith(f"cannot read {tmp_path}/none.toml")
     assert "there is no threshold 'nis': choose from gap_distance, " in refuse("trials", *out, "--sweep", "nis")

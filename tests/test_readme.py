@@ -10,7 +10,10 @@ from pathlib import Path
 import pytest
 
 from linemap_jax import Rules
-from linemap_jax.cli import Build, Demo, Evaluate, Extract, Simulate
+from linemap_jax.cli.build import Build, Demo
+from linemap_jax.cli.evaluate import Evaluate
+from linemap_jax.cli.extract import Extract
+from linemap_jax.cli.simulate import Simulate
 
 README = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from linemap_jax import cli
+from linemap_jax.cli import main
 from linemap_jax.core import lines
 from linemap_jax.lab import verification
 from linemap_jax.lab.verification import (
@@ -322,7 +322,7 @@ def test_the_command(
         table[3] = dataclasses.replace(table[3], checks=(Check("something", math.inf),))
     monkeypatch.setattr(verification, "verify", lambda: tuple(table))
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))  # so that the command line leaves jax as it is
-    status = cli.main(["verify", *(["--json"] if as_json else [])])
+    status = main(["verify", *(["--json"] if as_json else [])])
     out = capsys.readouterr().out
     assert status == (1 if broken else 0)
     if as_json:

@@ -1,0 +1,191 @@
+"""`linemap build` and `linemap demo`: from a log to a map, its picture and a summary."""
+
+import dataclasses
+import json
+import sys
+import time
+from collections.abc import Iterator
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from linemap_jax.cli.logs import SCANS_EXPLAINED, chunks_of_log, progress, warn
+from linemap_jax.cli.options import LogOptions, options_of_update
+from linemap_jax.cli.output import check_output, make_folder, say
+
+if TYPE_CHECKING:
+    from linemap_jax.core.state import LineMap, Report
+    from linemap_jax.io.log import Log
+
+DEMO_NOISE = {"range_sigma": 0.015, "bearing_sigma": 0.0005, "pose_sigma": (0.01, 0.01, 0.002)}
+"""What the demo log was made with."""
+
+START_CAPACITY = (1024, 512)
+"""Slots for lines and circles to begin with. To grow costs a compilation, and most buildings fit into these."""
+
+COUNTS = ("added", "fused", "merged", "trimmed", "split", "deleted")
+"""The counts of a `Report`."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Build(LogOptions):
+    """Build a map from a log: writes map.json and map.png, and prints a summary."""
+
+    log: tyro.conf.Positional[Path]
+    """CARMEN log, plain or .gz."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="DIR")]
+    """Folder for the map; made if it is not there."""
+    pose_error: Literal["independent", "persistent", "unknown"] = "unknown"
+    """How the errors of the poses hang together from scan to scan; `persistent` by [persistence] of the settings file.
+    With `unknown` covariances are bounds that hold in any case."""
+    json: bool = False
+    """Print the summary as JSON."""
+
+    def run(self) -> int:
+        """Build the map, and give the exit status."""
+        options = options_of_update(self) | {"pose_error": self.pose_error}
+        from linemap_jax.core.settings import Mount
+        from linemap_jax.core.state import Status
+        from linemap_jax.io.log import open_log
+        from linemap_jax.io.map_file import write_map
+        from linemap_jax.io.plot import plot_map
+
+        map_file, picture = self.output / "map.json", self.output / "map.png"
+        check_output(self.output, map_file, picture, overwrite=self.overwrite)
+        log = open_log(self.log, strict=self.strict, range_max=self.range_max)
+        if self.laser_offset is not None and next(iter(log)).pose_frame == "laser":
+            options["mount"] = Mount()
+            say(
+                f"warning: {log.path}: its poses are the laser's, so that --laser-offset has no effect",
+                quiet=self.quiet,
+            )
+        with progress(log, quiet=self.quiet):
+            line_map, report, positions, seconds, interrupted = _map_of_log(self, log, options)
+        warn(log, quiet=self.quiet)
+        lost = sum(bool(status & Status.POSE_NOT_FINITE) for status in report.status.tolist())
+        if lost:
+            say(
+                f"warning: {log.path}: {lost} scans were left out: their poses are not finite in {self.dtype}",
+                quiet=self.quiet,
+            )
+
+        settings = {
+            "log": self.log.name,
+            "preset": self.preset,
+            "pose_sigma": self.pose_sigma,
+            **{name: option for name, option in options.items() if name != "segmentation"},
+        }
+        make_folder(self.output)
+        write_map(map_file, line_map, settings, overwrite=self.overwrite)
+        plot_map(picture, line_map, positions, title=self.log.name, overwrite=self.overwrite)
+        if interrupted:
+            print(f"linemap: interrupted; the map so far is in {self.output}", file=sys.stderr)
+            return 130
+        summary = _summary(self, line_map, report, options, seconds) | {"map": str(map_file), "picture": str(picture)}
+        print(json.dumps(summary, indent=2) if self.json else _in_words(summary))
+        return 0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Demo:
+    """Build a map from the log that ships with the package: a cluttered laboratory with poles."""
+
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="DIR")] = Path("linemap-demo")
+    """Folder for the map; made if it is not there."""
+    overwrite: bool = False
+    """Replace output that is there already."""
+    quiet: bool = False
+    """No progress, no warnings."""
+
+    def run(self) -> int:
+        """Build the map, and give the exit status."""
+        log = resources.files("linemap_jax.io").joinpath("data", "demo.log.gz")
+        with resources.as_file(log) as path:
+            build = Build(log=path, output=self.output, overwrite=self.overwrite, quiet=self.quiet, **DEMO_NOISE)
+            return build.run()
+
+
+def _map_of_log(
+    command: Build, log: "Log", options: dict[str, Any]
+) -> tuple["LineMap", "Report", list[tuple[float, float]], list[float], bool]:
+    """The map, the reports, the positions of the robot, the seconds that each chunk took, reading included.
+
+    And whether somebody interrupted it: then the map is the one so far.
+    """
+    import numpy as np
+
+    from linemap_jax.build import CHUNK, build_chunks, join_reports
+    from linemap_jax.core.settings import Capacity
+
+    start = Capacity(*START_CAPACITY)
+    positions, reports, seconds = [], [], []
+
+    def driven() -> Iterator[Any]:
+        for chunk in chunks_of_log(command, log, CHUNK):
+            positions.extend(map(tuple, np.asarray(chunk.poses.mean)[:, :2].tolist()))
+            yield chunk.scans, chunk.poses
+
+    line_map, interrupted = None, False
+    started = time.perf_counter()
+    try:
+        for grown, report in build_chunks(driven(), map_capacity=start, chunk=CHUNK, **options):
+            line_map = grown
+            reports.append(report)
+            seconds.append(time.perf_counter() - started)
+            started = time.perf_counter()
+    except KeyboardInterrupt:
+        if line_map is None:
+            raise
+        interrupted = True
+    assert line_map is not None  # a log without a scan has been refused by its reader
+    return line_map, join_reports(reports), positions, seconds, interrupted
+
+
+def _summary(
+    command: Build, line_map: "LineMap", report: "Report", options: dict[str, Any], seconds: list[float]
+) -> dict[str, Any]:
+    """What `build` says about its map; for machines as JSON, for people in words."""
+    import numpy as np
+
+    from linemap_jax.build import CHUNK
+    from linemap_jax.io.log import open_log
+    from linemap_jax.lab.evaluation import duplicates, explained_share
+
+    # Evenly spread scans are enough for a share, and on a long log save a third of the time.
+    scans = int(report.status.shape[0])
+    seldom = dataclasses.replace(command, every=command.every * -(-scans // SCANS_EXPLAINED))
+    log = open_log(command.log, strict=command.strict, range_max=command.range_max)
+    chunks = ((chunk.scans, chunk.poses) for chunk in chunks_of_log(seldom, log, CHUNK))
+    share = explained_share(line_map, chunks, options["mount"], chunk=CHUNK)
+    lines = line_map.lines
+    length = np.asarray(lines.length)[np.asarray(lines.valid)]
+    return {
+        "log": str(command.log),
+        "preset": command.preset,
+        "scans": scans,
+        "lines": int(np.asarray(lines.valid).sum()),
+        "circles": int(np.asarray(line_map.circles.valid).sum()),
+        "explained": share,
+        "median_line_length_m": float(np.median(length)) if length.size else 0.0,
+        "duplicates": int(duplicates(lines).sum()),
+        # The first chunk holds the compilation: a log of one chunk does not tell.
+        "us_per_scan": 1e6 * float(np.median(seconds[1:])) / CHUNK if len(seconds) > 1 else None,
+        "seconds_to_first_chunk": seconds[0],
+        "counts": {name: int(np.asarray(getattr(report, name)).sum()) for name in COUNTS},
+    }
+
+
+def _in_words(summary: dict[str, Any]) -> str:
+    counts = ", ".join(f"{number} {what}" for what, number in summary["counts"].items())
+    pace = summary["us_per_scan"]
+    then = "too few scans to time" if pace is None else f"then {pace:.0f} us a scan"
+    return (
+        f"{summary['scans']} scans -> {summary['lines']} lines, {summary['circles']} circles ({counts})\n"
+        f"{summary['explained']:.1%} of the returns under 20 m lie within 10 cm of them; "
+        f"median line {summary['median_line_length_m']:.2f} m, {summary['duplicates']} duplicate lines\n"
+        f"{summary['seconds_to_first_chunk']:.1f} s to compile, {then}\n"
+        f"map:     {summary['map']}\n"
+        f"picture: {summary['picture']}"
+    )

@@ -1,0 +1,104 @@
+"""`linemap calibrate`: the noise of the scanner and of the poses, from a log."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from linemap_jax.cli.compilations import keep_compilations
+from linemap_jax.cli.logs import warn
+from linemap_jax.cli.options import MOST_SCANS, UsageError, check_offset, check_range_max
+from linemap_jax.cli.output import check_output, make_folder
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Calibrate:
+    """Tell the noise of the scanner and of the poses from a log."""
+
+    log: tyro.conf.Positional[Path]
+    """CARMEN log, plain or .gz."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE.toml")] = None
+    """Settings file for --config of the other commands, with the noise of the scanner."""
+    scans: Annotated[int, tyro.conf.arg(metavar="N")] = 1000
+    """Number of scans that are used at most, from the first on."""
+    lag: Annotated[int, tyro.conf.arg(metavar="N")] = 1
+    """Poses are compared with those N scans later: errors that last longer are not seen."""
+    range_max: Annotated[float | None, tyro.conf.arg(metavar="M")] = None
+    """Ranges from here on are no-returns, m. What the log states, or 50, unless given."""
+    laser_offset: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y THETA")] = None
+    """Pose of the laser on the robot, m m rad. Used only with poses that are the robot's."""
+    strict: bool = False
+    """Refuse a log with malformed lines, instead of skipping and counting them."""
+    overwrite: bool = False
+    """Replace output that is there already."""
+    quiet: bool = False
+    """No warnings."""
+    json: bool = False
+    """Print the result as JSON."""
+
+    def run(self) -> int:
+        """Tell the noise, and give the exit status."""
+        if not 2 <= self.scans <= MOST_SCANS:
+            raise UsageError(f"--scans must be from 2 to {MOST_SCANS}, not {self.scans}")
+        if not 1 <= self.lag < self.scans:
+            raise UsageError(f"--lag must be from 1 to less than the number of scans, not {self.lag}")
+        check_range_max(self.range_max)
+        check_offset(self.laser_offset)
+        if self.output:
+            check_output(self.output.parent, self.output, overwrite=self.overwrite)
+        import jax
+
+        jax.config.update("jax_enable_x64", True)
+        keep_compilations()
+        import numpy as np
+
+        from linemap_jax.core.settings import Mount, SensorNoise
+        from linemap_jax.io.atomic import atomic_write
+        from linemap_jax.io.log import open_log
+        from linemap_jax.io.scans import chunks_of_readings
+        from linemap_jax.lab.calibration import pose_noise, sensor_noise
+
+        log = open_log(self.log, strict=self.strict, range_max=self.range_max)
+        chunk = next(chunks_of_readings(log, self.scans, cov_pose=np.zeros((3, 3)), dtype="float64"))
+        warn(log, quiet=self.quiet)
+        mount = Mount(*self.laser_offset) if self.laser_offset else Mount()
+        try:
+            sensor = sensor_noise(chunk.scans)
+            noise = SensorNoise(range_sigma=float(sensor.sigma[0]), bearing_sigma=float(sensor.sigma[1]))
+            poses = pose_noise(chunk.scans, chunk.poses.mean, noise, mount, lag=self.lag)
+        except ValueError as error:
+            raise UsageError(f"{self.log}: {error}") from error
+        rows = {
+            name: {"sigma": sigma, "from": low, "to": high}
+            for estimate, names in (
+                (sensor, ("range_m", "bearing_rad")),
+                (poses, ("x_m", "y_m", "theta_rad", "walls_m", "walls_rad")),
+            )
+            for name, sigma, (low, high) in zip(names, estimate.sigma.tolist(), estimate.interval.tolist(), strict=True)
+        }
+        if self.output:
+            text = f"[noise]\nrange_sigma = {noise.range_sigma:.4g}\nbearing_sigma = {noise.bearing_sigma:.4g}\n"
+            make_folder(self.output.parent)
+            with atomic_write(self.output, overwrite=self.overwrite) as path:
+                path.write_text(text, encoding="utf-8")
+        if self.json:
+            print(
+                json.dumps(rows | {"beams": sensor.used, "lines": poses.used, "scans": len(chunk.timestamps)}, indent=2)
+            )
+            return 0
+        sigmas = {name: f"{row['sigma']:.3g}" for name, row in rows.items()}
+        print(
+            f"from {sensor.used} beams and {poses.used} pairs of lines in {len(chunk.timestamps)} scans, "
+            "95 % intervals:"
+        )
+        for name, row in rows.items():
+            what, unit = name.split("_")
+            told = f"{row['from']:.3g} to {row['to']:.3g}" if row["to"] < 100 * row["from"] else "not told by this log"
+            print(f"  {what:8s} {sigmas[name]} {unit} ({told})")
+        print(
+            f"--range-sigma {sigmas['range_m']} --bearing-sigma {sigmas['bearing_rad']} "
+            f"--pose-sigma {sigmas['x_m']} {sigmas['y_m']} {sigmas['theta_rad']}"
+        )
+        return 0

@@ -1,0 +1,44 @@
+"""`linemap extract`: the lines and circles of each scan."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from linemap_jax.cli.logs import chunks_of_log, progress, warn
+from linemap_jax.cli.options import LogOptions, options_of_update
+from linemap_jax.cli.output import say
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Extract(LogOptions):
+    """Extract lines and circles scan by scan: one JSON line a scan, in the frame of the sensor."""
+
+    log: tyro.conf.Positional[Path]
+    """CARMEN log, plain or .gz."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE.jsonl")]
+    """File to write."""
+
+    def run(self) -> int:
+        """Write them, and give the exit status."""
+        options = options_of_update(self)
+        from linemap_jax.build import CHUNK, extract_chunk
+        from linemap_jax.core.settings import SCAN_CAPACITY
+        from linemap_jax.io.atomic import atomic_write
+        from linemap_jax.io.jsonl import lines_of_extraction
+        from linemap_jax.io.log import open_log
+
+        del options["mount"], options["persistence"]  # the result stands in the frame of the sensor
+        log = open_log(self.log, strict=self.strict, range_max=self.range_max)
+        capacity, written = SCAN_CAPACITY, 0
+        with atomic_write(self.output, overwrite=self.overwrite) as path, path.open("w", encoding="utf-8") as file:
+            with progress(log, quiet=self.quiet):
+                for chunk in chunks_of_log(self, log, CHUNK):
+                    found, capacity = extract_chunk(chunk.scans, capacity=capacity, **options)
+                    for line in lines_of_extraction(chunk.timestamps, chunk.poses, found):
+                        file.write(line + "\n")
+                        written += 1
+        warn(log, quiet=self.quiet)
+        say(f"{written} scans -> {self.output}", quiet=self.quiet)
+        return 0

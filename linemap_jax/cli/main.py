@@ -1,0 +1,62 @@
+"""Reads the options, runs the command, and turns what goes wrong into one sentence."""
+
+import sys
+from typing import Annotated
+
+import tyro
+
+from linemap_jax.cli.build import Build, Demo
+from linemap_jax.cli.calibrate import Calibrate
+from linemap_jax.cli.evaluate import Evaluate
+from linemap_jax.cli.extract import Extract
+from linemap_jax.cli.options import UsageError
+from linemap_jax.cli.simulate import Simulate
+from linemap_jax.cli.trials import Trials
+from linemap_jax.cli.verify import Verify
+
+Command = (
+    Annotated[Demo, tyro.conf.subcommand("demo")]
+    | Annotated[Build, tyro.conf.subcommand("build")]
+    | Annotated[Extract, tyro.conf.subcommand("extract")]
+    | Annotated[Simulate, tyro.conf.subcommand("simulate")]
+    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[Trials, tyro.conf.subcommand("trials")]
+    | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
+    | Annotated[Verify, tyro.conf.subcommand("verify")]
+)
+"""What can be run; each holds its options."""
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+      args: the arguments; those of the process unless given.
+
+    Returns:
+      The exit status: 0; 1 if `verify` found a check that fails; 2 for bad input, about which one sentence has been
+      printed; 130 for an interrupt.
+    """
+    command = tyro.cli(
+        Command,
+        prog="linemap",
+        description="Maps of line segments and circles from 2D range scans, with covariances that can be believed.",
+        config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
+        args=args,
+    )
+    # What follows loads jax, which takes a second: not before the options are known to be right.
+    from linemap_jax.io.atomic import OutputError
+    from linemap_jax.io.config import ConfigError
+    from linemap_jax.io.log import LogError
+    from linemap_jax.io.map_file import MapFileError
+    from linemap_jax.io.table import TableError
+    from linemap_jax.io.worlds import WorldFileError
+
+    try:
+        return command.run()
+    except (LogError, OutputError, MapFileError, TableError, WorldFileError, ConfigError, UsageError) as error:
+        print(f"linemap: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("linemap: interrupted", file=sys.stderr)
+        return 130

@@ -1,0 +1,130 @@
+"""Options that several commands share: what is refused of them, and what they are to `update`."""
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from linemap_jax.cli.compilations import keep_compilations
+
+MOST_SCANS = 20_000
+"""Of a simulated drive, which is held in memory as a whole."""
+
+
+class UsageError(Exception):
+    """What is wrong with the command, in one sentence."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LogOptions:
+    """Options of all commands that read a log."""
+
+    preset: Literal["default", "paper"] = "default"
+    """The method: `paper` is the literal reading of 1996, `default` the same with its known faults mended."""
+    config: Path | None = None
+    """TOML file with tables [thresholds], [noise], [rules], [persistence]; goes over the preset. Options given here go
+    over both."""
+    range_sigma: Annotated[float | None, tyro.conf.arg(metavar="M")] = None
+    """Standard deviation of a range, m. 0.02 unless given."""
+    bearing_sigma: Annotated[float | None, tyro.conf.arg(metavar="RAD")] = None
+    """Standard deviation of a bearing, rad. 0.001 unless given."""
+    pose_sigma: Annotated[tuple[float, float, float], tyro.conf.arg(metavar="X Y THETA")] = (0.05, 0.05, 0.01)
+    """Standard deviations of every pose, m m rad: logs do not state them."""
+    range_min: Annotated[float, tyro.conf.arg(metavar="M")] = 0.0
+    """Smallest range that counts as a return, m."""
+    range_max: Annotated[float | None, tyro.conf.arg(metavar="M")] = None
+    """Ranges from here on are no-returns, m. What the log states, or 50, unless given."""
+    laser_offset: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y THETA")] = None
+    """Pose of the laser on the robot, m m rad. Used only with poses that are the robot's."""
+    covariance: Literal["exact", "printed"] | None = None
+    """`exact` to first order, or eq. 12 as `printed`. That of the preset unless given."""
+    jacobians: Literal["autodiff", "analytic"] = "analytic"
+    """Derivatives by autodiff through the estimate, or the hand-derived ones; the maps are the same."""
+    segmentation: Literal["incremental"] = "incremental"
+    """How points are divided into lines."""
+    every: Annotated[int, tyro.conf.arg(metavar="N")] = 1
+    """Take every N-th scan."""
+    dtype: Literal["float32", "float64"] = "float32"
+    """Precision of all numbers."""
+    strict: bool = False
+    """Refuse a log with malformed lines, instead of skipping and counting them."""
+    overwrite: bool = False
+    """Replace output that is there already."""
+    quiet: bool = False
+    """No progress, no warnings."""
+
+
+def options_of_update(command: LogOptions) -> dict[str, Any]:
+    """The keyword arguments of `update`: preset, then the settings file, then the options of the command line."""
+    _check(command)
+    import jax
+
+    jax.config.update("jax_enable_x64", command.dtype == "float64")
+    from linemap_jax.core.settings import Mount, SensorNoise
+
+    options = options_of_method(command.preset, command.config)
+    options |= {"mount": Mount(), "noise": options["noise"] or SensorNoise()}
+    sigmas = {"range_sigma": command.range_sigma, "bearing_sigma": command.bearing_sigma}
+    given = {name: sigma for name, sigma in sigmas.items() if sigma is not None}
+    options["noise"] = dataclasses.replace(options["noise"], **given)
+    if command.laser_offset is not None:
+        options["mount"] = Mount(*command.laser_offset)
+    if command.covariance is not None:
+        options["covariance"] = command.covariance
+    return options | {"jacobians": command.jacobians, "segmentation": command.segmentation}
+
+
+def options_of_method(name: Literal["default", "paper"], config: Path | None) -> dict[str, Any]:
+    """The preset, and the settings file over it; no noise unless the file states it."""
+    keep_compilations()
+    from linemap_jax.core.settings import Persistence, SensorNoise, preset
+    from linemap_jax.io.config import read_config
+
+    options = preset(name) | {"noise": None, "persistence": Persistence()}
+    for section, fields in (read_config(config) if config else {}).items():
+        options[section] = dataclasses.replace(options[section] or SensorNoise(), **fields)
+    return options
+
+
+def _check(command: LogOptions) -> None:
+    """Refuse numbers that make no sense."""
+    inf = float("inf")
+    if not 1 <= command.every <= 10**9:
+        raise UsageError(f"--every must be from 1 to 10^9, not {command.every}")
+    if not 0 <= command.range_min < inf:
+        raise UsageError(f"--range-min must be zero or positive, not {command.range_min}")
+    if command.range_max is not None and not command.range_min < command.range_max:
+        raise UsageError(f"--range-max must be more than --range-min, not {command.range_max}")
+    if command.range_sigma is not None and not 0 < command.range_sigma < inf:
+        raise UsageError(f"--range-sigma must be positive, not {command.range_sigma}")
+    if command.bearing_sigma is not None and not 0 <= command.bearing_sigma < inf:
+        raise UsageError(f"--bearing-sigma must be zero or positive, not {command.bearing_sigma}")
+    if not all(0 <= x < inf for x in command.pose_sigma):
+        raise UsageError(f"--pose-sigma must be zero or positive, not {command.pose_sigma}")
+    check_offset(command.laser_offset)
+
+
+def check_range_max(range_max: float | None) -> None:
+    """Refuse a range that cannot be the first one of no return."""
+    if range_max is not None and not range_max > 0:
+        raise UsageError(f"--range-max must be positive, not {range_max}")
+
+
+def check_offset(offset: tuple[float, float, float] | None) -> None:
+    """Refuse a pose of the laser that is none."""
+    if offset is not None and not all(map(math.isfinite, offset)):
+        raise UsageError(f"--laser-offset must be finite, not {offset}")
+
+
+def check_drive(*, scans: int, pose_sigma: tuple[float, float, float], pose_correlation: float, seed: int) -> None:
+    """Refuse numbers that make no sense for a simulated drive."""
+    if not 1 <= scans <= MOST_SCANS:
+        raise UsageError(f"--scans must be from 1 to {MOST_SCANS}, not {scans}")
+    if not all(0 <= x < float("inf") for x in pose_sigma):
+        raise UsageError(f"--pose-sigma must be zero or positive, not {pose_sigma}")
+    if not 0 <= pose_correlation <= 1:
+        raise UsageError(f"--pose-correlation must be from 0 to 1, not {pose_correlation}")
+    if not 0 <= seed < 2**63:
+        raise UsageError(f"--seed must be from 0 to 2^63 - 1, not {seed}")

@@ -1,0 +1,213 @@
+"""`linemap trials`: many simulated drives, mapped and scored."""
+
+import contextlib
+import dataclasses
+import json
+import math
+import os
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from linemap_jax.cli.options import UsageError, check_drive, options_of_method
+from linemap_jax.cli.worlds import WorldKind, made_world
+
+if TYPE_CHECKING:
+    from jax.sharding import Mesh
+
+MOST_RUNS = 10**8
+"""Of trials."""
+
+BATCH_RUNS = 32
+"""Drives that one device simulates side by side."""
+
+CHUNK_RUNS = 256
+"""Drives after which the results are written, of all devices together."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Trials:
+    """Simulate, map and score many drives, each in a world of its own; a run that was stopped goes on."""
+
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="DIR")]
+    """Folder for the results, a Parquet table with one row a drive. Goes on with one of the same trials."""
+    kind: WorldKind = "changing_room"
+    """Worlds to drive through."""
+    runs: Annotated[int, tyro.conf.arg(metavar="N")] = 1000
+    """Number of drives."""
+    scans: Annotated[int, tyro.conf.arg(metavar="N")] = 50
+    """Number of scans of each."""
+    scanner: Literal["pls", "lms200", "utm30lx", "rplidar_a1"] = "pls"
+    """The instrument; the map builder knows its noise."""
+    preset: Literal["default", "paper"] = "default"
+    """The method."""
+    config: Path | None = None
+    """TOML file with tables [thresholds], [noise], [rules], [persistence]; goes over the preset."""
+    pose_sigma: Annotated[tuple[float, float, float], tyro.conf.arg(metavar="X Y THETA")] = (0.01, 0.01, 0.002)
+    """Standard deviations of every pose, m m rad."""
+    pose_correlation: Annotated[float, tyro.conf.arg(metavar="A")] = 0.0
+    """Of the pose errors, from one scan to the next: 0 for independent ones, 1 for one error that stays."""
+    pose_error: Literal["independent", "persistent", "unknown"] = "unknown"
+    """What the map builder believes of that."""
+    sweep: Annotated[tuple[str, ...], tyro.conf.arg(metavar="[NAME ...]")] = ()
+    """Thresholds to vary, one at a time, in the same drives: each from a quarter to four times its value."""
+    seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0
+    """Decides everything that is left to chance."""
+    devices: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Processors, or accelerators, that share the work. All of them unless given."""
+    quiet: bool = False
+    """No progress."""
+    json: bool = False
+    """Print the summary as JSON."""
+
+    def run(self) -> int:
+        """Run what is still to do of the trials, and give the exit status."""
+        check_drive(
+            scans=self.scans, pose_sigma=self.pose_sigma, pose_correlation=self.pose_correlation, seed=self.seed
+        )
+        if not 1 <= self.runs <= MOST_RUNS:
+            raise UsageError(f"--runs must be from 1 to {MOST_RUNS}, not {self.runs}")
+        options = options_of_method(self.preset, self.config)
+        mesh = _devices(self.devices)
+        import jax
+        import jax.numpy as jnp
+        import numpy as np
+        from tqdm import tqdm
+
+        from linemap_jax.io.table import ResultsTable
+        from linemap_jax.lab.batch import run_chunks
+        from linemap_jax.lab.scanners import PRESETS
+        from linemap_jax.lab.trials import Conditions, Trial, columns_of, recommend, summary, sweep, trial
+
+        thresholds, noise = options.pop("thresholds"), options.pop("noise")
+        conditions = Conditions(
+            scanner=PRESETS[self.scanner](),
+            cov_pose=jnp.diag(jnp.square(jnp.asarray(self.pose_sigma))),
+            correlation=self.pose_correlation,
+        )
+
+        known = [field.name for field in dataclasses.fields(thresholds)]
+        for name in self.sweep:
+            if name not in known:
+                raise UsageError(f"--sweep: there is no threshold {name!r}: choose from {', '.join(known)}")
+        varied, variants = sweep(thresholds, self.sweep)
+
+        def experiment(run: Any, *common: Any) -> Any:
+            noise, conditions = common
+            of_world, of_drive = jax.random.split(run["key"])
+            of_run = Trial(
+                key=of_drive,
+                world=made_world(self.kind, of_world, scans=self.scans),
+                thresholds=run["thresholds"],
+                noise=noise,
+            )
+            return trial(of_run, conditions, scans=self.scans, pose_error=self.pose_error, **options)
+
+        batches = max(1, CHUNK_RUNS // (BATCH_RUNS * mesh.size))
+        chunk = BATCH_RUNS * batches * mesh.size
+        told = {k: v for k, v in dataclasses.asdict(self).items() if k not in ("output", "devices", "quiet", "json")}
+        told |= {"config": self.config and self.config.read_text(encoding="utf-8")}
+        table = ResultsTable(self.output, told)
+        total, done = self.runs * len(varied), table.rows
+        if done % chunk and done < total:
+            raise UsageError(f"{self.output} holds {done} drives, which are no chunks of {chunk}: give --devices")
+        # All variants of one drive stand side by side.
+        drive, variant = np.divmod(np.arange(total), len(varied))
+        runs = {
+            "key": jax.random.split(jax.random.key(self.seed), self.runs)[drive],
+            "thresholds": jax.tree.map(lambda x: x[variant], variants),
+        }
+        started = time.perf_counter()
+        with tqdm(
+            total=total, initial=done, unit="drive", disable=True if self.quiet else None, file=sys.stderr
+        ) as progress:
+            common = (noise, conditions)
+            chunks = run_chunks(experiment, runs, *common, mesh=mesh, batch=BATCH_RUNS, batches=batches, start=done)
+            for first, rows in chunks if done < total else ():
+                here = slice(first, first + len(rows.lines))
+                which = [varied[i] for i in variant[here]]
+                columns: dict[str, Any] = {"drive": drive[here]}
+                if self.sweep:
+                    columns |= {"threshold": [name for name, _ in which], "value": [value for _, value in which]}
+                table.append(first, columns | columns_of(rows))
+                progress.update(len(rows.lines))
+        seconds = time.perf_counter() - started
+        results = table.read()
+        speed = {"seconds": seconds, "drives_per_second": (total - done) / seconds}
+        if self.sweep:
+            of_variants = [
+                {name: column[i :: len(varied)] for name, column in results.items()} for i in range(len(varied))
+            ]
+            advice = recommend(varied, of_variants)
+            costs, differences, errors = (
+                np.concatenate([getattr(one, name) for one in advice]).tolist()
+                for name in ("costs", "differences", "errors")
+            )
+            scores = [
+                {"threshold": name, "value": value, "cost": costs[i], "difference": differences[i], "error": errors[i]}
+                | summary(of_variants[i])
+                for i, (name, value) in enumerate(varied)
+            ]
+            recommended = {one.threshold: one.value for one in advice}
+            document = {"variants": scores, "recommended": recommended, **speed}
+            print(json.dumps(document, indent=2) if self.json else _sweep_in_words(scores, recommended))
+        else:
+            score = summary(results) | speed
+            print(json.dumps(score, indent=2) if self.json else _trials_in_words(score))
+        if not self.json:
+            print(f"{total} drives -> {self.output}")
+        return 0
+
+
+def _devices(count: int | None) -> "Mesh":
+    """So many devices in a row; of processors, as many as the machine has."""
+    processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    import jax
+
+    # Without effect where jax has counted its devices already, or where they are accelerators.
+    with contextlib.suppress(RuntimeError):
+        jax.config.update("jax_num_cpu_devices", processors)
+    from linemap_jax.lab.batch import mesh_of_devices
+
+    try:
+        return mesh_of_devices(count)
+    except ValueError as error:
+        raise UsageError(f"--devices: {error}") from error
+
+
+def _sweep_in_words(scores: list[dict[str, Any]], recommended: dict[str, float]) -> str:
+    names = ("cost", "precision", "recall", "duplicates", "false_matches", "missed_matches", "gone", "noticed")
+    lines = [f"{'threshold':22s} {'value':>8s} " + " ".join(f"{name:>14s}" for name in names)]
+    for score in scores:
+        cells = ["-" if score[name] is None else f"{score[name]:.2%}" for name in names]
+        mark = " <-" if score["value"] == recommended[score["threshold"]] else ""
+        cells = " ".join(f"{cell:>14s}" for cell in cells)
+        lines.append(f"{score['threshold']:22s} {score['value']:8.4g} {cells}{mark}")
+    lines.append("cost: the sum of the shares of all mistakes; <- recommended: the least cost if that is sure")
+    return "\n".join(lines)
+
+
+def _trials_in_words(score: dict[str, Any]) -> str:
+    def share(name: str) -> str:
+        return "-" if score[name] is None else f"{score[name]:.2%}"
+
+    def number(name: str, scale: float = 1.0) -> str:
+        return "-" if score[name] is None else f"{scale * score[name]:.2f}"
+
+    return "\n".join(
+        [
+            f"length within 5 cm: precision {share('precision')}, recall {share('recall')}",
+            f"{share('duplicates')} of {score['walls']} walls are held twice, {score['fragments']} pieces are too "
+            f"many; {share('phantom_lines')} of {score['lines']} lines are phantoms",
+            f"error {number('offset_rms_m', 100)} cm, {number('angle_rms_rad', 180 / math.pi)} degrees (rms); "
+            f"mean NEES {number('mean_nees')}, {share('covered')} inside the 95 % ellipse",
+            f"{share('missed_poles')} of {score['poles']} poles are missed, {share('phantom_circles')} of "
+            f"{score['circles']} circles are phantoms",
+            f"matches: {share('false_matches')} false, {share('missed_matches')} missed of {score['matches']}",
+            f"{share('gone')} of {score['vanished']} vanished things are gone after three scans that could tell, "
+            f"{share('noticed')} of {score['appeared']} new ones are there",
+        ]
+    )
