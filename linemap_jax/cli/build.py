@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from linemap_jax.cli.compilations import cache_folder
 from linemap_jax.cli.logs import SCANS_EXPLAINED, chunks_of_log, progress, warn
 from linemap_jax.cli.options import LogOptions, options_of_update
 from linemap_jax.cli.output import check_output, make_folder, say
@@ -116,9 +117,11 @@ def _map_of_log(
     """
     import numpy as np
 
-    from linemap_jax.build import CHUNK, build_chunks, join_reports
+    from linemap_jax.build import CHUNK, COMPILER_OPTIONS, STATIC, build_chunks, join_reports, update_chunk
     from linemap_jax.core.settings import Capacity
+    from linemap_jax.io.programs import kept_program
 
+    run = kept_program(update_chunk, cache_folder(), static_argnames=STATIC, compiler_options=COMPILER_OPTIONS)
     start = Capacity(*START_CAPACITY)
     positions, reports, seconds = [], [], []
 
@@ -130,7 +133,7 @@ def _map_of_log(
     line_map, interrupted = None, False
     started = time.perf_counter()
     try:
-        for grown, report in build_chunks(driven(), map_capacity=start, chunk=CHUNK, **options):
+        for grown, report in build_chunks(driven(), map_capacity=start, chunk=CHUNK, run=run, **options):
             line_map = grown
             reports.append(report)
             seconds.append(time.perf_counter() - started)
