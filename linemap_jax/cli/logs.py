@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from linemap_jax.io.log import Log
     from linemap_jax.io.scans import Chunk
 
-SCANS_EXPLAINED = 500
+SCANS_EXPLAINED = 250
 """What a log says of a map is taken over so many of its scans at most."""
 
 

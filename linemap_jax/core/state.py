@@ -33,8 +33,8 @@ def _exportable(cls: type) -> type:
     export.register_pytree_node_serialization(
         cls,
         serialized_name=f"{cls.__module__}.{cls.__qualname__}",
-        serialize_auxdata=lambda names: json.dumps(names).encode(),
-        deserialize_auxdata=lambda names: tuple(json.loads(names)),
+        serialize_auxdata=lambda aux_data: json.dumps(aux_data).encode(),
+        deserialize_auxdata=lambda serialized_aux_data: tuple(json.loads(serialized_aux_data)),
     )
     return cls
 
