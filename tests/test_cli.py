@@ -14,9 +14,11 @@ import jax
 import numpy as np
 import pytest
 
+from linemap_jax import PAPER_RULES, PAPER_THRESHOLDS, Rules, Thresholds
 from linemap_jax.cli import main
 from linemap_jax.cli.build import Build
 from linemap_jax.cli.extract import Extract
+from linemap_jax.io.config import read_config
 
 BEAMS = 181  # one number in the whole file: each other number would be compiled anew
 SCANS = 10
@@ -218,6 +220,19 @@ def test_config_goes_over_the_preset_and_options_over_both(run, log, tmp_path):
     assert document["lines"] == []  # the longest wall has 6 m
 
 
+def test_the_settings_come_as_a_file_that_is_read_back(run, refuse, tmp_path):
+    status, text, _ = run("config", "--preset", "paper", "--scanner", "pls")
+    assert status == 0
+    assert "[noise]\n# Of a range, m.\nrange_sigma = 0.0169\n" in text  # 5 cm / 3, and rounding to 1 cm
+    (tmp_path / "settings.toml").write_text(text)
+    options = read_config(tmp_path / "settings.toml")
+    assert Thresholds(**options["thresholds"]) == PAPER_THRESHOLDS
+    assert Rules(**options["rules"]) == PAPER_RULES
+    assert run("config", "--config", tmp_path / "settings.toml") == (0, text, "")
+    (tmp_path / "settings.toml").write_text(text.replace("gap_beams", "gap_beam"))
+    assert "did you mean 'gap_beams'?" in refuse("config", "--config", tmp_path / "settings.toml")
+
+
 def test_the_paper_preset_in_float64_with_two_rules_switched(run, log, tmp_path):
     config = tmp_path / "settings.toml"
     config.write_text("[rules]\nfit_circles = true\nweigh_circles = true\n")
@@ -357,10 +372,17 @@ EMPTY_SCANS = {
 def test_scans_that_hold_nothing(run, write, tmp_path, kind):
     path = write(*[flaser(EMPTY_SCANS[kind], (0, 0, 0), 100 + i) for i in range(3)])
     status, out, err = run("build", path, "-o", tmp_path / "out")
-    assert (status, err) == (0, "")
+    assert status == 0
     document = json.loads((tmp_path / "out/map.json").read_text())
     assert document["lines"] == []
     assert len(document["circles"]) <= 1
+    if not document["circles"]:
+        said = re.fullmatch(r"linemap: warning: \S+: nothing was found in 543 beams: (\d+) gave no return.*\n", err)
+        assert said is not None, err
+        assert int(said[1]) == 3 * np.sum(~((EMPTY_SCANS[kind] > 0) & (EMPTY_SCANS[kind] < 50)))
+        assert run("extract", path, "-o", tmp_path / "again.jsonl")[2].startswith(err)
+    else:
+        assert err == ""
     assert run("extract", path, "-o", tmp_path / "found.jsonl", "--quiet") == (0, "", "")
     assert len((tmp_path / "found.jsonl").read_text().splitlines()) == 3
 

@@ -15,6 +15,7 @@ from linemap_jax.cli.compilations import cache_folder
 from linemap_jax.cli.logs import SCANS_EXPLAINED, chunks_of_log, progress, warn
 from linemap_jax.cli.options import LogOptions, options_of_update
 from linemap_jax.cli.output import check_output, make_folder, say
+from linemap_jax.cli.rejections import Rejections
 
 if TYPE_CHECKING:
     from linemap_jax.core.state import LineMap, Report
@@ -71,6 +72,9 @@ class Build(LogOptions):
                 f"warning: {log.path}: {lost} scans were left out: their poses are not finite in {self.dtype}",
                 quiet=self.quiet,
             )
+
+        if not line_map.lines.valid.any() and not line_map.circles.valid.any():
+            say(f"warning: {log.path}: {_rejections(self, log, options)}", quiet=self.quiet)
 
         settings = {
             "log": self.log.name,
@@ -144,6 +148,20 @@ def _map_of_log(
         interrupted = True
     assert line_map is not None  # a log without a scan has been refused by its reader
     return line_map, join_reports(reports), positions, seconds, interrupted
+
+
+def _rejections(command: Build, log: "Log", options: dict[str, Any]) -> Rejections:
+    """Why the scans of a log gave nothing: they are extracted once more, which the map has no use for otherwise."""
+    from linemap_jax.build import CHUNK, extract_chunk
+    from linemap_jax.core.settings import SCAN_CAPACITY
+
+    rejections, capacity = Rejections(), SCAN_CAPACITY
+    of_map = ("mount", "persistence", "pose_error")
+    options = {name: option for name, option in options.items() if name not in of_map}
+    for chunk in chunks_of_log(command, log, CHUNK):
+        found, capacity = extract_chunk(chunk.scans, capacity=capacity, **options)
+        rejections.add(found)
+    return rejections
 
 
 def _summary(

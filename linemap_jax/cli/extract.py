@@ -9,6 +9,7 @@ import tyro
 from linemap_jax.cli.logs import chunks_of_log, progress, warn
 from linemap_jax.cli.options import LogOptions, options_of_update
 from linemap_jax.cli.output import say
+from linemap_jax.cli.rejections import Rejections
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -31,14 +32,17 @@ class Extract(LogOptions):
 
         del options["mount"], options["persistence"]  # the result stands in the frame of the sensor
         log = open_log(self.log, strict=self.strict, range_max=self.range_max)
-        capacity, written = SCAN_CAPACITY, 0
+        capacity, written, rejections = SCAN_CAPACITY, 0, Rejections()
         with atomic_write(self.output, overwrite=self.overwrite) as path, path.open("w", encoding="utf-8") as file:
             with progress(log, quiet=self.quiet):
                 for chunk in chunks_of_log(self, log, CHUNK):
                     found, capacity = extract_chunk(chunk.scans, capacity=capacity, **options)
+                    rejections.add(found)
                     for line in lines_of_extraction(chunk.timestamps, chunk.poses, found):
                         file.write(line + "\n")
                         written += 1
         warn(log, quiet=self.quiet)
+        if not rejections.found:
+            say(f"warning: {self.log}: {rejections}", quiet=self.quiet)
         say(f"{written} scans -> {self.output}", quiet=self.quiet)
         return 0

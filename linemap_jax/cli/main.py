@@ -7,6 +7,7 @@ import tyro
 
 from linemap_jax.cli.build import Build, Demo
 from linemap_jax.cli.calibrate import Calibrate
+from linemap_jax.cli.config import Config
 from linemap_jax.cli.evaluate import Evaluate
 from linemap_jax.cli.extract import Extract
 from linemap_jax.cli.options import UsageError
@@ -22,6 +23,7 @@ Command = (
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Trials, tyro.conf.subcommand("trials")]
     | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
+    | Annotated[Config, tyro.conf.subcommand("config")]
     | Annotated[Verify, tyro.conf.subcommand("verify")]
 )
 """What can be run; each holds its options."""

@@ -3,14 +3,21 @@
 import dataclasses
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from linemap_jax.cli.compilations import keep_compilations
 
+if TYPE_CHECKING:
+    from linemap_jax.core.settings import SensorNoise
+
 MOST_SCANS = 20_000
 """Of a simulated drive, which is held in memory as a whole."""
+
+
+ScannerName = Literal["pls", "lms200", "utm30lx", "rplidar_a1"]
+"""Instruments of `lab.scanners`."""
 
 
 class UsageError(Exception):
@@ -24,12 +31,14 @@ class LogOptions:
     preset: Literal["default", "paper"] = "default"
     """The method: `paper` is the literal reading of 1996, `default` the same with its known faults mended."""
     config: Path | None = None
-    """TOML file with tables [thresholds], [noise], [rules], [persistence]; goes over the preset. Options given here go
-    over both."""
+    """TOML file with tables [thresholds], [noise], [rules], [persistence], as `linemap config` writes it; goes over the
+    preset. Options given here go over both."""
+    scanner: ScannerName | None = None
+    """The instrument: stands for the noise that its data sheet states, unless the settings file states it."""
     range_sigma: Annotated[float | None, tyro.conf.arg(metavar="M")] = None
-    """Standard deviation of a range, m. 0.02 unless given."""
+    """Standard deviation of a range, m. That of the scanner, or 0.02, unless given."""
     bearing_sigma: Annotated[float | None, tyro.conf.arg(metavar="RAD")] = None
-    """Standard deviation of a bearing, rad. 0.001 unless given."""
+    """Standard deviation of a bearing, rad. That of the scanner, or 0.001, unless given."""
     pose_sigma: Annotated[tuple[float, float, float], tyro.conf.arg(metavar="X Y THETA")] = (0.05, 0.05, 0.01)
     """Standard deviations of every pose, m m rad: logs do not state them."""
     range_min: Annotated[float, tyro.conf.arg(metavar="M")] = 0.0
@@ -62,10 +71,9 @@ def options_of_update(command: LogOptions) -> dict[str, Any]:
     import jax
 
     jax.config.update("jax_enable_x64", command.dtype == "float64")
-    from linemap_jax.core.settings import Mount, SensorNoise
+    from linemap_jax.core.settings import Mount
 
-    options = options_of_method(command.preset, command.config)
-    options |= {"mount": Mount(), "noise": options["noise"] or SensorNoise()}
+    options = options_of_method(command.preset, command.config, noise_of_scanner(command.scanner)) | {"mount": Mount()}
     sigmas = {"range_sigma": command.range_sigma, "bearing_sigma": command.bearing_sigma}
     given = {name: sigma for name, sigma in sigmas.items() if sigma is not None}
     options["noise"] = dataclasses.replace(options["noise"], **given)
@@ -76,16 +84,31 @@ def options_of_update(command: LogOptions) -> dict[str, Any]:
     return options | {"jacobians": command.jacobians, "segmentation": command.segmentation}
 
 
-def options_of_method(name: Literal["default", "paper"], config: Path | None) -> dict[str, Any]:
-    """The preset, and the settings file over it; no noise unless the file states it."""
+def options_of_method(
+    name: Literal["default", "paper"], config: Path | None, noise: "SensorNoise | None" = None
+) -> dict[str, Any]:
+    """The preset with some noise, and the settings file over it; no noise where neither states it."""
     keep_compilations()
     from linemap_jax.core.settings import Persistence, SensorNoise, preset
     from linemap_jax.io.config import read_config
 
-    options = preset(name) | {"noise": None, "persistence": Persistence()}
+    options = preset(name) | {"noise": noise, "persistence": Persistence()}
     for section, fields in (read_config(config) if config else {}).items():
         options[section] = dataclasses.replace(options[section] or SensorNoise(), **fields)
     return options
+
+
+def noise_of_scanner(name: ScannerName | None) -> "SensorNoise":
+    """The noise of an instrument; the default's where none is named."""
+    from linemap_jax.core.settings import SensorNoise
+
+    if name is None:
+        return SensorNoise()
+    from linemap_jax.lab.scanners import PRESETS, noise_of
+
+    noise = noise_of(PRESETS[name]())
+    # Data sheets do not state more digits.
+    return SensorNoise(range_sigma=float(f"{noise.range_sigma:.3g}"), bearing_sigma=float(f"{noise.bearing_sigma:.3g}"))
 
 
 def _check(command: LogOptions) -> None:

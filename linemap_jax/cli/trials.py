@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from linemap_jax.cli.options import UsageError, check_drive, options_of_method
+from linemap_jax.cli.options import ScannerName, UsageError, check_drive, options_of_method
 from linemap_jax.cli.worlds import WorldKind, made_world
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ class Trials:
     """Number of drives."""
     scans: Annotated[int, tyro.conf.arg(metavar="N")] = 50
     """Number of scans of each."""
-    scanner: Literal["pls", "lms200", "utm30lx", "rplidar_a1"] = "pls"
+    scanner: ScannerName = "pls"
     """The instrument; the map builder knows its noise."""
     preset: Literal["default", "paper"] = "default"
     """The method."""
