@@ -81,7 +81,7 @@ def extract(
         covariance=covariance,
         jacobians=jacobians,
     )
-    return dataclasses.replace(found, status=found.status | jnp.where(finite, 0, int(Status.POSE_NOT_FINITE)))
+    return dataclasses.replace(found, status=found.status | status_of_pose(finite))
 
 
 def usable(scan: Scan, pose: Pose) -> tuple[Scan, Pose, Bool[Array, ""]]:
@@ -94,6 +94,11 @@ def usable(scan: Scan, pose: Pose) -> tuple[Scan, Pose, Bool[Array, ""]]:
     ranges, bearings = (jnp.where(valid, x, 0) for x in (scan.ranges, scan.bearings))
     pose = jax.tree.map(lambda x: jnp.where(finite, x, 0), pose)
     return dataclasses.replace(scan, ranges=ranges, bearings=bearings, valid=valid), pose, finite
+
+
+def status_of_pose(finite: Bool[Array, ""]) -> Int[Array, ""]:
+    """What a pose has to say."""
+    return jnp.where(finite, int(Status.OK), int(Status.POSE_NOT_FINITE)).astype(jnp.int32)
 
 
 def extract_points(

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Int
 
 from linemap_jax.core import fusion, matching, wiping
 from linemap_jax.core.circles import near_lines
-from linemap_jax.core.extract import as_dtype, extract_points, usable, with_defaults
+from linemap_jax.core.extract import as_dtype, extract_points, status_of_pose, usable, with_defaults
 from linemap_jax.core.sensor import Points, points_from_scan
 from linemap_jax.core.settings import (
     SCAN_CAPACITY,
@@ -115,10 +115,38 @@ def update(
         covariance=covariance,
         jacobians=jacobians,
     )
+    found = dataclasses.replace(found, status=found.status | status_of_pose(finite))
+    return integrate(line_map, points, found, pose, thresholds, noise, lasting, pose_error=pose_error, rules=rules)
 
+
+def integrate(
+    line_map: LineMap,
+    points: Points,
+    found: Extraction,
+    pose: Pose,
+    thresholds: Thresholds,
+    noise: SensorNoise,
+    lasting: Persistence,
+    *,
+    pose_error: PoseError,
+    rules: Rules,
+) -> tuple[LineMap, Report]:
+    """`update`, from the lines and circles of the scan on: match, fuse or add, merge, wipe.
+
+    Args:
+      line_map: the map so far.
+      points: the points of the scan, whose beams wipe.
+      found: what they hold.
+      pose: of the robot.
+      thresholds: gates, and how far wiping reaches.
+      noise: of the sensor.
+      lasting: what of the pose error persists, by `persistence_of`.
+      pose_error: as for `update`.
+      rules: which reading of the method.
+    """
     if pose_error == "persistent":
         # A scan without returns is none, so that a chunk may be filled up with such.
-        kept = jnp.where(jnp.any(scan.valid), jnp.square(lasting.correlation), 1)
+        kept = jnp.where(jnp.any(points.valid), jnp.square(lasting.correlation), 1)
         line_map = dataclasses.replace(
             line_map,
             lines=fusion.forget(line_map.lines, kept),
@@ -138,8 +166,7 @@ def update(
         lasting.share,
     )
 
-    status = found.status | jnp.where(finite, 0, int(Status.POSE_NOT_FINITE))
-    status |= jnp.where(lines.overflow | swept.wiped.overflow, int(Status.MAP_LINES_FULL), 0)
+    status = found.status | jnp.where(lines.overflow | swept.wiped.overflow, int(Status.MAP_LINES_FULL), 0)
     status |= jnp.where(circles.overflow, int(Status.MAP_CIRCLES_FULL), 0)
     report = Report(
         line_slot=lines.slot,

@@ -18,7 +18,7 @@ class Runs:
     of_point: Int[Array, " N"]  # slot of each point's run, -1 for none
 
     def sum(self, per_point: Float[Array, "N *s"]) -> Float[Array, "K *s"]:
-        """Sum over the points of each run, in one pass: runs are consecutive, and each sum begins at its first point."""
+        """Sum over the points of each run, in one pass: each sum begins at the first point of its run."""
         n = self.of_point.shape[0]
         rows = jnp.where((self.of_point >= 0)[:, None], per_point.reshape(n, -1), 0)
         begins = jnp.zeros(n, bool).at[self.first].set(True)
