@@ -22,6 +22,7 @@ from linemap_jax.core.settings import (
     Covariance,
     Jacobians,
     Mount,
+    Number,
     Persistence,
     PoseError,
     Rules,
@@ -208,7 +209,7 @@ def _update_lines(
     thresholds: Thresholds,
     rules: Rules,
     pose_error: PoseError,
-    share: Array,
+    share: Number,
 ) -> _LineUpdate:
     """Section 5.1: match, then fuse or add, then merge."""
     new = found.lines
@@ -382,7 +383,7 @@ def _update_circles(
     thresholds: Thresholds,
     rules: Rules,
     pose_error: PoseError,
-    share: Array,
+    share: Number,
 ) -> _CircleUpdate:
     """Section 5.2: match, then fuse or add; and none too close to a line."""
     new = fusion.forget(found.circles, share)
