@@ -46,9 +46,8 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec  # noqa: E402
 
 from linemap_jax import Capacity, Pose, Scan, empty_map, extract, preset, update  # noqa: E402
 from linemap_jax.build import COMPILER_OPTIONS  # noqa: E402
-from linemap_jax.core.extract import extract_points, with_defaults  # noqa: E402
+from linemap_jax.core.extract import observe, with_defaults  # noqa: E402
 from linemap_jax.core.mapping import integrate  # noqa: E402
-from linemap_jax.core.sensor import points_from_scan  # noqa: E402
 from linemap_jax.core.settings import persistence_of  # noqa: E402
 from linemap_jax.core.slots import resize  # noqa: E402
 from linemap_jax.io.log import open_log  # noqa: E402
@@ -143,24 +142,22 @@ def map_step(capacity: int, dtype: str) -> Row:
     line_map = type(line_map)(lines=resize(line_map.lines, capacity), circles=resize(line_map.circles, capacity))
     scan, pose = jax.tree.map(lambda x: x[30], (scans, poses))
     thresholds, noise, mount = with_defaults(None, None, None, np.dtype(dtype))
-    rules, options = preset("default")["rules"], {"jacobians": "analytic"}
-    points = jax.jit(partial(points_from_scan, **options))(scan, pose, mount)
-    found = jax.jit(
-        partial(
-            extract_points,
-            capacity=Capacity(20, 9),
-            rules=rules,
-            segmentation="incremental",
-            covariance="exact",
-            **options,
-        )
-    )(points, pose, thresholds, noise)
+    rules = preset("default")["rules"]
+    look = partial(
+        observe,
+        capacity=Capacity(20, 9),
+        rules=rules,
+        segmentation="incremental",
+        covariance="exact",
+        jacobians="analytic",
+    )
+    points, pose, found = jax.jit(look)(scan, pose, thresholds, noise, mount)
     lasting = jax.tree.map(partial(jnp.asarray, dtype=dtype), persistence_of("unknown", None))
 
     def several(line_map: Any, found: Any) -> Any:
         def step(line_map: Any, _: Any) -> Any:
             after, report = integrate(
-                line_map, points, found, pose, thresholds, noise, lasting, pose_error="unknown", rules=rules
+                line_map, points, pose, found, thresholds, noise, lasting, pose_error="unknown", rules=rules
             )
             return after, report.status
 

@@ -14,8 +14,8 @@ from jaxtyping import Array, Bool, Int
 
 from linemap_jax.core import fusion, matching, wiping
 from linemap_jax.core.circles import near_lines
-from linemap_jax.core.extract import as_dtype, extract_points, status_of_pose, usable, with_defaults
-from linemap_jax.core.sensor import Points, points_from_scan
+from linemap_jax.core.extract import as_dtype, observe, with_defaults
+from linemap_jax.core.sensor import Points
 from linemap_jax.core.settings import (
     SCAN_CAPACITY,
     Capacity,
@@ -101,30 +101,27 @@ def update(
     if line_map.lines.offset.dtype != dtype:
         raise ValueError(f"the map is {line_map.lines.offset.dtype} and the scan {dtype}; make both the same")
     thresholds, noise, mount = with_defaults(thresholds, noise, mount, dtype)
-    lasting = as_dtype(persistence_of(pose_error, persistence), dtype)
-    pose = as_dtype(pose, dtype)
-    scan, pose, finite = usable(scan, pose)
-    points = points_from_scan(scan, pose, mount, jacobians=jacobians)
-    found = extract_points(
-        points,
+    points, pose, found = observe(
+        scan,
         pose,
         thresholds,
         noise,
+        mount,
         capacity=capacity,
         rules=rules,
         segmentation=segmentation,
         covariance=covariance,
         jacobians=jacobians,
     )
-    found = dataclasses.replace(found, status=found.status | status_of_pose(finite))
-    return integrate(line_map, points, found, pose, thresholds, noise, lasting, pose_error=pose_error, rules=rules)
+    lasting = as_dtype(persistence_of(pose_error, persistence), dtype)
+    return integrate(line_map, points, pose, found, thresholds, noise, lasting, pose_error=pose_error, rules=rules)
 
 
 def integrate(
     line_map: LineMap,
     points: Points,
-    found: Extraction,
     pose: Pose,
+    found: Extraction,
     thresholds: Thresholds,
     noise: SensorNoise,
     lasting: Persistence,
@@ -137,8 +134,8 @@ def integrate(
     Args:
       line_map: the map so far.
       points: the points of the scan, whose beams wipe.
-      found: what they hold.
-      pose: of the robot.
+      pose: of the robot, finite.
+      found: what the points hold; see `observe`.
       thresholds: gates, and how far wiping reaches.
       noise: of the sensor.
       lasting: what of the pose error persists, by `persistence_of`.
