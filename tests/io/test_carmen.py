@@ -10,8 +10,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from linemap_jax.io.carmen import MAX_LINE, RANGE_MAX, assumed_sweep
-from linemap_jax.io.log import LogError, Notes, Reading, open_log
+from linemap_jax.io.carmen import MAX_LINE, assumed_sweep
+from linemap_jax.io.log import RANGE_MAX, LogError, Notes, Reading, open_log
 
 DATA = Path(os.environ.get("LINEMAP_DATA", Path(__file__).parents[2] / "../shared/data")) / "carmen"
 POSE = (1.0, 2.0, 0.5)
