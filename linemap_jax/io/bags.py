@@ -158,7 +158,7 @@ class _Bag:
         self.path = path
         self._read = 0
         try:
-            ros1 = path.is_file() and path.open("rb").read(7) == b"#ROSBAG"
+            ros1 = _begins(path, b"#ROSBAG")
             self._reader = Reader1(path) if ros1 else Reader2(path)
             self._reader.open()
         except Exception as error:
@@ -571,6 +571,13 @@ def _seconds(stamp: Any) -> float:
     return stamp.sec + 1e-9 * stamp.nanosec
 
 
+def _begins(path: Path, magic: bytes) -> bool:
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(len(magic)) == magic
+
+
 def _storage(path: Path) -> str:
     files = [path] if path.is_file() else list(path.iterdir())
     return "MCAP" if any(file.name.endswith((".mcap", ".mcap.zstd")) for file in files) else "SQLite"
@@ -587,7 +594,7 @@ def _cannot_open(path: Path, error: Exception) -> str:
         return "is cut off, or was not closed when it was recorded: its end is missing (`mcap recover` saves the rest)"
     if "Unrecognized storage format" in told:
         return "is a file of a ROS 2 bag, but its name ends neither in .mcap nor in .db3"
-    return f"cannot be read as a bag: {told}"
+    return f"cannot be read as a ROS bag: {told}"
 
 
 def _told(error: Exception) -> str:

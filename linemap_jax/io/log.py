@@ -168,7 +168,8 @@ class Notes:
         for kind, count in self.duplicates.items():
             said.append(f"{count} {kind} lines were left out: the log has the scans of this laser in another form too")
         if self.other_beam_counts:
-            said.append(f"{_scans(self.other_beam_counts)} do not have the {self.beam_count} beams of the first one")
+            others = f"{_scans(self.other_beam_counts)} with other than the {self.beam_count} of the first"
+            said.append(f"the number of beams varies: {others}")
         return said + self.assumptions
 
     def _places(self, listed: list[int], count: int) -> str:
@@ -285,7 +286,7 @@ def open_log(
         if magic.startswith(start):
             raise LogError(path, what)
     if not carmen.recognise(path):
-        raise LogError(path, "is neither a CARMEN log nor a ROS bag, nor of another format that can be read")
+        raise LogError(path, "is not a CARMEN log, nor a ROS bag: no format that can be read")
     if scan_topic is not None or odom_topic is not None:
         raise LogError(path, "is a CARMEN log, which has no topics to choose from")
     return carmen.CarmenLog(path, options, progress=progress)
