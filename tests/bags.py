@@ -70,13 +70,13 @@ class Recording:
         message = {"stamp": stamp, "frame": parent, "child": child, "at": translation, "turn": rotation}
         self.messages.append(("/tf_static" if static else "/tf", TF, _or(recorded, stamp), message))
 
-    def write(self, folder: Path, kind: str = "bag", name: str = "log") -> Path:
+    def write(self, folder: Path, kind: str = "bag", name: str = "log", *, tf_type: str = TF) -> Path:
         """Write the bag: "bag", "bag-lz4", "bag-bz2"; or a folder, "db3", "db3-zstd", "mcap", "mcap-zstd"."""
         storage, _, packed = kind.partition("-")
         path = folder / (f"{name}.bag" if storage == "bag" else name)
         store = get_typestore(Stores.ROS1_NOETIC if storage == "bag" else Stores.ROS2_HUMBLE)
-        if TF not in store.types:
-            store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TF))
+        if tf_type not in store.types:
+            store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", tf_type))
         if storage == "bag":
             writer = Writer1(path)
             if packed:
@@ -91,9 +91,10 @@ class Recording:
         with writer:
             connections = {}
             for topic, type_, recorded, fields in sorted(self.messages, key=lambda message: message[2]):
+                name_of_type = tf_type if type_ == TF else type_
                 if topic not in connections:
-                    connections[topic] = writer.add_connection(topic, type_, typestore=store)
-                data = serialize(_message(store, type_, fields), type_)
+                    connections[topic] = writer.add_connection(topic, name_of_type, typestore=store)
+                data = serialize(_message(store, name_of_type, fields), name_of_type)
                 writer.write(connections[topic], round(1e9 * recorded), data)
         return path
 
@@ -118,7 +119,7 @@ def _message(store: Any, type_: str, fields: dict[str, Any]) -> Any:
     vector, quaternion = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Quaternion"]
     if type_ == SCAN:
         return types[type_](header=header, intensities=np.zeros(0, np.float32), **fields)
-    if type_ == TF:
+    if "at" in fields:
         transform = types["geometry_msgs/msg/Transform"](
             translation=vector(*map(float, fields["at"])), rotation=quaternion(*map(float, fields["turn"]))
         )

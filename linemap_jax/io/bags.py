@@ -156,7 +156,6 @@ class _Bag:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._read = 0
         try:
             ros1 = _begins(path, b"#ROSBAG")
             self._reader = Reader1(path) if ros1 else Reader2(path)
@@ -216,16 +215,16 @@ class _Bag:
         """Stream messages in the order of recording: what they are of, when they were recorded (s), and their bytes."""
         if not connections:
             return
-        source = self._reader.messages(connections, start=start)
+        source, read = self._reader.messages(connections, start=start), 0
         while True:
             try:
                 connection, time, raw = next(source)
             except StopIteration:
                 return
             except Exception as error:
-                where = f"after {self._read} messages" if self._read else "before its first message"
+                where = f"after {read} messages" if read else "before the first message that is needed"
                 raise LogError(self.path, f"is damaged {where}: {_told(error)}") from error
-            self._read += 1
+            read += 1
             yield connection, 1e-9 * time, raw
 
     def message(self, connection: Connection, raw: bytes) -> Any:
@@ -281,7 +280,9 @@ class _Plan:
             notes.poses = "given"
             return options.poses, _robot_frame(bag, topics, ancestors)
         fixed = _fixed_frame(tree, ancestors)
-        corrected = fixed is not None and _last_part(fixed) in CORRECTED
+        below = [] if fixed is None else ancestors[: ancestors.index(fixed)]
+        # Simulators and others join map and odom once and for all: nobody corrects anything then.
+        corrected = fixed is not None and _last_part(fixed) in CORRECTED and below[-1] not in tree.static
         if len(topics) == 1 and (options.odom_topic is not None or not corrected):
             self._odometry_topic = topics[0]
             parent, child = _first(bag, topics[0], lambda m: (_frame(m.header.frame_id), _frame(m.child_frame_id)))
@@ -289,7 +290,6 @@ class _Plan:
             notes.poses = f"nav_msgs/Odometry on {topics[0]}"
             return Chain([self._odometry], []), child or _robot_frame(bag, [], ancestors)
         if fixed is not None:
-            below = ancestors[: ancestors.index(fixed)]
             robot = next((name for name in below if tree.tracks[name].moves), self._laser)
             notes.poses = f"tf, {robot} in {fixed}"
             return tree.chain(robot, fixed), robot
