@@ -91,8 +91,9 @@ def _scanner_in_words(told: dict[str, Any]) -> list[str]:
             + (f"; seen {told['nearest_m']:.2f} m to {told['farthest_m']:.2f} m" if told["nearest_m"] else ""),
         ]
         said += [f"  {told['shares'][name]:8.2%} {what}" for name, what in SHARES.items() if told["shares"][name]]
-        noise = told["scans_with_covariance"]
-        said.append(f"poses:    {told['poses']}, for {told['scans_with_pose']} scans; covariance stated for {noise}")
+        known, noise = told["scans_with_pose"], told["scans_with_covariance"]
+        coverage = f", for {known} scans; covariance stated for {noise}" if known else ""
+        said.append(f"poses:    {told['poses']}{coverage}")
         if told["mounting"]:
             said.append(f"laser on the robot: {told['mounting']}")
         if told["scans_in_motion"]:

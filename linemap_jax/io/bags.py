@@ -30,7 +30,18 @@ from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag2 import Reader as Reader2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from linemap_jax.io.frames import Chain, FrameTree, Poses, Track, compose, planar, poses_of_sweep, transform_of, upright
+from linemap_jax.io.frames import (
+    Chain,
+    FrameTree,
+    Poses,
+    Standstill,
+    Track,
+    compose,
+    planar,
+    poses_of_sweep,
+    transform_of,
+    upright,
+)
 from linemap_jax.io.log import RANGE_MAX, LogError, Notes, Options, Progress, Reading
 
 SCAN = "sensor_msgs/msg/LaserScan"
@@ -277,7 +288,7 @@ class _Plan:
             topics = [_chosen(bag, options.odom_topic, ODOMETRY, topics)]
         ancestors = tree.ancestors(self._laser)
         if options.poses is not None:
-            notes.poses = "given"
+            notes.poses = options.poses.description
             return options.poses, _robot_frame(bag, topics, ancestors)
         fixed = _fixed_frame(tree, ancestors)
         below = [] if fixed is None else ancestors[: ancestors.index(fixed)]
@@ -423,7 +434,7 @@ class _Plan:
                 notes.assume(f"the laser is tilted by {tilt:.0f} degrees; its scans were taken as if it were level")
         if self._options.mount is not None:
             self._mount, notes.mounting = self._options.mount, "given"
-        elif chain is None and self.poses is not None:
+        elif chain is None and self.poses is not None and not isinstance(self.poses, Standstill):
             notes.mounting = "not known"
             notes.assume(
                 f"tf does not say where the laser {self._laser!r} sits on the robot"
@@ -590,6 +601,8 @@ def _cannot_open(path: Path, error: Exception) -> str:
         return f"cannot be read: {error.strerror or error}"
     if "not indexed" in told:
         return "was not closed when it was recorded, or is cut off: it has no index (`rosbag reindex` makes one)"
+    if "index looks damaged" in told:
+        return "is cut off or damaged: its index cannot be read (`rosbag reindex` makes a new one)"
     if "end magic" in told:
         return "is cut off, or was not closed when it was recorded: its end is missing (`mcap recover` saves the rest)"
     if "Unrecognized storage format" in told:

@@ -116,7 +116,8 @@ class CarmenLog:
             first malformed line.
         """
         notes = self.notes = Notes()
-        notes.poses = "of the laser, as the log states them" if self._options.poses is None else "given"
+        given = self._options.poses
+        notes.poses = "of the laser, as the log states them" if given is None else given.description
         parser = _Parser(notes, self._options)
         with _opened(self.path) as (file, stream):
             size = os.fstat(file.fileno()).st_size

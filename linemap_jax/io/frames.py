@@ -90,7 +90,13 @@ def _rotated(by: Transform, x: float, y: float, z: float) -> tuple[float, float,
 
 
 class Poses(Protocol):
-    """Poses in the plane over time."""
+    """Poses in the plane over time.
+
+    Attributes:
+      description: where they come from, in words.
+    """
+
+    description: str
 
     def covers(self, begin: float, end: float) -> bool:
         """Whether the poses from one stamp to another are known. s."""
@@ -107,6 +113,8 @@ class Poses(Protocol):
 
 class Trajectory:
     """Poses in the plane at given stamps, interpolated between them."""
+
+    description = "of a given trajectory"
 
     def __init__(self, stamps: np.ndarray, poses: np.ndarray) -> None:
         """A trajectory from stamps, s, and poses x, y, theta, m, m, rad.
@@ -141,6 +149,8 @@ class Trajectory:
 
 class Standstill:
     """The pose of a robot that stays at the origin."""
+
+    description = "of a robot that stands still"
 
     def covers(self, begin: float, end: float) -> bool:
         """Always."""
@@ -230,6 +240,8 @@ class Track:
 
 class Chain:
     """The pose of a frame in another one, over tracks that lead up from it and down to it."""
+
+    description = "of frames"
 
     def __init__(self, up: list[Track], down: list[Track]) -> None:
         """The tracks from the frame up to a common ancestor, and from the other frame up to it."""

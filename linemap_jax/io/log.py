@@ -153,8 +153,8 @@ class Notes:
                 f"the first fault, {self.first_fault}"
             )
         if self.without_pose:
-            were = "was" if self.without_pose == 1 else "were"
-            said.append(f"{_scans(self.without_pose)} {were} left out: no pose is known for their time")
+            were, their = ("was", "its") if self.without_pose == 1 else ("were", "their")
+            said.append(f"{_scans(self.without_pose)} {were} left out: no pose is known for {their} time")
         if self.backward_stamps:
             said.append(
                 f"the time stamp steps back at {_scans(self.backward_stamps)} "

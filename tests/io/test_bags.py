@@ -313,7 +313,7 @@ def test_poses_of_the_user_go_before_those_of_the_log(tmp_path):
     np.testing.assert_allclose([r.pose[2] for r in readings], 3 + (2 * np.pi - 6) * np.array([1, 3, 5]) / 6, atol=1e-5)
     assert readings[0].cov_pose is None
     assert readings[0].mount == pytest.approx((0.2, 0.1, 0.1))
-    assert (notes.poses, notes.without_pose) == ("given", 1)
+    assert (notes.poses, notes.without_pose) == ("of a given trajectory", 1)
 
 
 def test_a_log_without_poses(tmp_path):
@@ -328,6 +328,9 @@ def test_a_log_without_poses(tmp_path):
     assert notes.warnings() == []
     readings, notes = read(path, poses=Standstill())
     assert [r.pose.tolist() for r in readings] == [[0, 0, 0]] * 3
+    assert (notes.poses, notes.warnings()) == ("of a robot that stands still", [])
+    readings, notes = read(path, poses=Trajectory(np.array([100.0, 102.0]), np.zeros((2, 3))))
+    assert len(readings) == 3
     assert "sits on the robot" in notes.warnings()[0]
 
 
