@@ -704,4 +704,4 @@ def test_info_of_a_bag_without_scans_tells_the_rest(run, refuse, tmp_path):
     assert "1 /odom (nav_msgs/msg/Odometry)" in out
     assert "it holds no sensor_msgs/LaserScan" in out
     bag.write_bytes(bag.read_bytes()[:300])
-    assert "ROS bag" in refuse("info", bag)
+    assert "is cut off or damaged" in refuse("info", bag)

@@ -26,10 +26,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from rosbags.interfaces import Connection
-from rosbags.rosbag1 import Reader as Reader1
-from rosbags.rosbag2 import Reader as Reader2
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from linemap_jax.io.bag_file import ODOMETRY, SCAN, TF, BagFile, Fault, plain
 from linemap_jax.io.frames import (
     Chain,
     FrameTree,
@@ -43,10 +41,6 @@ from linemap_jax.io.frames import (
     upright,
 )
 from linemap_jax.io.log import RANGE_MAX, LogError, Notes, Options, Progress, Reading
-
-SCAN = "sensor_msgs/msg/LaserScan"
-ODOMETRY = "nav_msgs/msg/Odometry"
-TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
 MAX_WAIT = 5.0
 """s. A scan waits so long, by the time of recording, for the poses that it needs."""
@@ -73,10 +67,6 @@ _PROBED = 300  # messages of tf looked at, at the beginning, in the middle and t
 _MOST_STATIC = 10_000  # messages of tf_static looked at
 _TILTED = math.cos(math.radians(10.0))
 _MOVED = 1e-3  # m, and rad: the laser sits somewhere else on the robot
-
-
-class _Fault(Exception):
-    """What is wrong with one message."""
 
 
 class BagLog:
@@ -109,7 +99,7 @@ class BagLog:
             poses where they are needed; if `strict`, at the first malformed scan.
         """
         notes = self.notes = Notes(unit="scan")
-        with closing(_Bag(self.path)) as bag:
+        with closing(BagFile(self.path)) as bag:
             self.format = bag.format
             notes.messages, notes.types = dict(bag.counts), dict(bag.types)
             plan = _Plan(bag, self._options, notes)
@@ -123,7 +113,7 @@ class BagLog:
                     notes.lines = number
                     try:
                         pending.append(plan.scan(bag.message(connection, raw), number, recorded))
-                    except _Fault as fault:
+                    except Fault as fault:
                         if self._options.strict:
                             raise LogError(self.path, str(fault), f"scan {number}") from None
                         notes.skip(number, str(fault))
@@ -156,101 +146,10 @@ class _Pending(NamedTuple):
     message: Any
 
 
-class _Bag:
-    """A bag, open. The only place that calls the library, which raises whatever its parsing of damaged bytes runs into.
-
-    Attributes:
-      format: what it is, in words.
-      counts: messages by topic.
-      types: type of the messages by topic.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        try:
-            ros1 = _begins(path, b"#ROSBAG")
-            self._reader = Reader1(path) if ros1 else Reader2(path)
-            self._reader.open()
-        except Exception as error:
-            raise LogError(path, _cannot_open(path, error)) from error
-        store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.LATEST)
-        if TF[0] not in store.types:
-            store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TF[0]))
-        self._deserialize = store.deserialize_ros1 if ros1 else store.deserialize_cdr
-        kind = "ROS 1 bag" if ros1 else "ROS 2 bag"
-        self.format = kind if ros1 else f"{kind}, {_storage(path)}"
-        self.connections: list[Connection] = list(self._reader.connections)
-        self.counts: dict[str, int] = {}
-        self.types: dict[str, str] = {}
-        for connection in sorted(self.connections, key=lambda c: c.topic):
-            self.counts[connection.topic] = self.counts.get(connection.topic, 0) + connection.msgcount
-            self.types[connection.topic] = connection.msgtype
-        self._digests: dict[str, str] = {}
-        if ros1:
-            self._digests = {name: store.generate_msgdef(name)[1] for name in (SCAN, ODOMETRY)}
-        files = [path] if path.is_file() else [file for file in path.iterdir() if file.is_file()]
-        self.size = sum(file.stat().st_size for file in files)
-
-    def close(self) -> None:
-        """Close the files."""
-        self._reader.close()
-
-    @property
-    def span(self) -> tuple[int, int]:
-        """Times of the first and of the last message, ns."""
-        return self._reader.start_time, self._reader.end_time
-
-    def progress(self, recorded: float) -> tuple[int, int]:
-        """Bytes read by a time of recording, and bytes in all."""
-        begin, end = self.span
-        share = (1e9 * recorded - begin) / max(end - begin, 1)
-        return int(self.size * min(max(share, 0.0), 1.0)), self.size
-
-    def of_topic(self, topic: str) -> list[Connection]:
-        """What was recorded of a topic, by whomever it was published."""
-        connections = [connection for connection in self.connections if connection.topic == topic]
-        for connection in connections:
-            known = self._digests.get(connection.msgtype)
-            if known is not None and connection.digest not in (known, "", "*"):
-                cause = f"holds another definition of {_plain(connection.msgtype)} than the one of ROS"
-                raise LogError(self.path, f"{cause}, and cannot be read", topic)
-        return connections
-
-    def of_types(self, *types: str) -> list[Connection]:
-        """What was recorded of messages of some types; only topics that hold any."""
-        return [c for c in self.connections if c.msgtype in types and self.counts[c.topic] > 0]
-
-    def messages(
-        self, connections: list[Connection], *, start: int | None = None
-    ) -> Iterator[tuple[Connection, float, bytes]]:
-        """Stream messages in the order of recording: what they are of, when they were recorded (s), and their bytes."""
-        if not connections:
-            return
-        source, read = self._reader.messages(connections, start=start), 0
-        while True:
-            try:
-                connection, time, raw = next(source)
-            except StopIteration:
-                return
-            except Exception as error:
-                where = f"after {read} messages" if read else "before the first message that is needed"
-                raise LogError(self.path, f"is damaged {where}: {_told(error)}") from error
-            read += 1
-            yield connection, 1e-9 * time, raw
-
-    def message(self, connection: Connection, raw: bytes) -> Any:
-        """A message taken apart; raises `_Fault` where that fails."""
-        name = TF[0] if connection.msgtype in TF else connection.msgtype
-        try:
-            return self._deserialize(raw, name)
-        except Exception as error:
-            raise _Fault(f"the {name.rsplit('/', 1)[1]} message is damaged: {_told(error)}") from error
-
-
 class _Plan:
     """What is read of a bag, and what one pass has to remember. Made from a look at parts of the bag."""
 
-    def __init__(self, bag: _Bag, options: Options, notes: Notes) -> None:
+    def __init__(self, bag: BagFile, options: Options, notes: Notes) -> None:
         self._options = options
         self._notes = notes
         self.scan_topic = _scan_topic(bag, options, notes)
@@ -280,7 +179,7 @@ class _Plan:
             if name not in self._tree.static:
                 track.clear()
 
-    def _chosen_poses(self, bag: _Bag) -> tuple[Poses | None, str | None]:
+    def _chosen_poses(self, bag: BagFile) -> tuple[Poses | None, str | None]:
         """Where the poses come from, if there are any, and the name of the frame that they are the poses of."""
         options, notes, tree = self._options, self._notes, self._tree
         topics = sorted({connection.topic for connection in bag.of_types(ODOMETRY)})
@@ -316,11 +215,11 @@ class _Plan:
             "those of the robot by --poses FILE.tum, or say by --standstill that it stood still (`extract` needs none)",
         )
 
-    def note(self, connection: Connection, bag: _Bag, raw: bytes) -> None:
+    def note(self, connection: Connection, bag: BagFile, raw: bytes) -> None:
         """Take in a message of odometry or tf. One that is malformed says nothing, and is passed over."""
         try:
             message = bag.message(connection, raw)
-        except _Fault as fault:
+        except Fault as fault:
             self._notes.assume(f"a message of {connection.topic} was passed over: {fault}")
             return
         if connection.msgtype == ODOMETRY and self._odometry is not None:
@@ -343,11 +242,11 @@ class _Plan:
         beams = len(message.ranges)
         angles = (message.angle_min, message.angle_increment)
         if beams == 0:
-            raise _Fault("the LaserScan has no ranges")
+            raise Fault("the LaserScan has no ranges")
         if not all(map(math.isfinite, angles)) or (angles[1] == 0 and beams > 1):
-            raise _Fault(f"angle_min {angles[0]:g} and angle_increment {angles[1]:g} of {beams} beams are no sweep")
+            raise Fault(f"angle_min {angles[0]:g} and angle_increment {angles[1]:g} of {beams} beams are no sweep")
         if self._options.bearing_override is None and abs(angles[1]) * (beams - 1) > 4 * math.pi:
-            raise _Fault(f"{beams} beams at an angle_increment of {angles[1]:g} rad go around more than twice")
+            raise Fault(f"{beams} beams at an angle_increment of {angles[1]:g} rad go around more than twice")
         stamp = _seconds(message.header.stamp)
         if stamp == 0:
             self._notes.assume("scans without a time stamp have that of their recording")
@@ -471,7 +370,7 @@ def covariance_in_the_plane(stated: np.ndarray) -> np.ndarray | None:
     return cov if np.linalg.eigvalsh(cov / np.outer(sigmas, sigmas))[0] > 1e-9 else None
 
 
-def _scan_topic(bag: _Bag, options: Options, notes: Notes) -> str:
+def _scan_topic(bag: BagFile, options: Options, notes: Notes) -> str:
     """The topic of the scans to read."""
     topics = sorted({connection.topic for connection in bag.of_types(SCAN)})
     notes.scan_topics = topics
@@ -482,22 +381,22 @@ def _scan_topic(bag: _Bag, options: Options, notes: Notes) -> str:
     if topics:
         listed = ", ".join(f"{topic} ({bag.counts[topic]})" for topic in topics)
         raise LogError(bag.path, f"holds the scans of several scanners, choose one by --scan-topic: {listed}")
-    listed = ", ".join(f"{topic} ({_plain(type_)}, {bag.counts[topic]})" for topic, type_ in bag.types.items())
+    listed = ", ".join(f"{topic} ({plain(type_)}, {bag.counts[topic]})" for topic, type_ in bag.types.items())
     told = f"; its topics: {listed}" if listed else ", nor any other message"
     raise LogError(bag.path, f"holds no sensor_msgs/LaserScan{told}")
 
 
-def _chosen(bag: _Bag, wanted: str, type_: str, topics: list[str]) -> str:
+def _chosen(bag: BagFile, wanted: str, type_: str, topics: list[str]) -> str:
     """The topic that somebody asked for, with or without the slash before it."""
     name = "/" + wanted.strip("/")
     for topic in topics:
         if name == "/" + topic.strip("/"):
             return topic
     listed = f"; those are on {', '.join(topics)}" if topics else "; there are none"
-    raise LogError(bag.path, f"holds no {_plain(type_)} on the topic {wanted!r}{listed}")
+    raise LogError(bag.path, f"holds no {plain(type_)} on the topic {wanted!r}{listed}")
 
 
-def _look_at_frames(bag: _Bag) -> FrameTree:
+def _look_at_frames(bag: BagFile) -> FrameTree:
     """The frames that tf knows: all of tf_static, and parts of tf."""
     tree = FrameTree()
     connections = bag.of_types(*TF)
@@ -511,7 +410,7 @@ def _look_at_frames(bag: _Bag) -> FrameTree:
         for _, (connection, _, raw) in zip(range(most), bag.messages(chosen, start=start), strict=False):
             try:
                 _add_transforms(tree, bag.message(connection, raw), static=is_static)
-            except _Fault:
+            except Fault:
                 continue  # told when the log is read
     return tree
 
@@ -538,20 +437,20 @@ def _fixed_frame(tree: FrameTree, ancestors: list[str]) -> str | None:
     return root if any(tree.tracks[name].moves for name in told(root)) else None
 
 
-def _robot_frame(bag: _Bag, topics: list[str], ancestors: list[str]) -> str | None:
+def _robot_frame(bag: BagFile, topics: list[str], ancestors: list[str]) -> str | None:
     """The robot's frame: of odometry, or by its name."""
     if topics and (child := _first(bag, topics[0], lambda message: _frame(message.child_frame_id))):
         return child
     return next((frame for name in ROBOT for frame in ancestors if _last_part(frame) == name), None)
 
 
-def _first(bag: _Bag, topic: str, field: Any) -> Any:
+def _first(bag: BagFile, topic: str, field: Any) -> Any:
     """A field of the first message of a topic that can be taken apart."""
     fault = None
     for connection, _, raw in bag.messages(bag.of_topic(topic)):
         try:
             return field(bag.message(connection, raw))
-        except _Fault as caught:
+        except Fault as caught:
             fault = caught
     raise LogError(bag.path, f"no message on {topic} can be read: {fault}")
 
@@ -565,11 +464,6 @@ def _frame(name: str) -> str:
     return name.lstrip("/")
 
 
-def _plain(type_: str) -> str:
-    """A type of messages as people write it."""
-    return type_.replace("/msg/", "/")
-
-
 def _last_part(frame: str) -> str:
     return frame.rsplit("/", 1)[-1]
 
@@ -580,37 +474,3 @@ def _transform(translation: Any, rotation: Any) -> Any:
 
 def _seconds(stamp: Any) -> float:
     return stamp.sec + 1e-9 * stamp.nanosec
-
-
-def _begins(path: Path, magic: bytes) -> bool:
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return file.read(len(magic)) == magic
-
-
-def _storage(path: Path) -> str:
-    files = [path] if path.is_file() else list(path.iterdir())
-    return "MCAP" if any(file.name.endswith((".mcap", ".mcap.zstd")) for file in files) else "SQLite"
-
-
-def _cannot_open(path: Path, error: Exception) -> str:
-    """What to tell of a bag that the library does not open."""
-    told = _told(error)
-    if isinstance(error, OSError):
-        return f"cannot be read: {error.strerror or error}"
-    if "not indexed" in told:
-        return "was not closed when it was recorded, or is cut off: it has no index (`rosbag reindex` makes one)"
-    if "index looks damaged" in told:
-        return "is cut off or damaged: its index cannot be read (`rosbag reindex` makes a new one)"
-    if "end magic" in told:
-        return "is cut off, or was not closed when it was recorded: its end is missing (`mcap recover` saves the rest)"
-    if "Unrecognized storage format" in told:
-        return "is a file of a ROS 2 bag, but its name ends neither in .mcap nor in .db3"
-    return f"cannot be read as a ROS bag: {told}"
-
-
-def _told(error: Exception) -> str:
-    """What an exception of the library says, in one line."""
-    said = " ".join(str(error).split()).rstrip(".")
-    return said[:300] if said else type(error).__name__
