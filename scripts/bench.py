@@ -280,6 +280,7 @@ def still_scans() -> Scan:
         bearings=jnp.asarray(np.nan_to_num(bearings)),
         valid=jnp.asarray(valid),
         spacing=jnp.asarray(np.nanmedian(np.abs(np.diff(bearings, axis=1)), axis=1)),
+        first=jnp.zeros(len(ranges), jnp.int32),
     )
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from linemap_jax.cli.compilations import cache_folder
-from linemap_jax.cli.logs import SCANS_EXPLAINED, chunks_of_log, progress, warn
+from linemap_jax.cli.logs import SCANS_EXPLAINED, chunks_of_log, mount_of, opened, progress, tell_poses, warn
 from linemap_jax.cli.options import LogOptions, options_of_update
 from linemap_jax.cli.output import check_output, make_folder, say
 from linemap_jax.cli.rejections import Rejections
@@ -36,7 +36,7 @@ class Build(LogOptions):
     """Build a map from a log: writes map.json and map.png, and prints a summary."""
 
     log: tyro.conf.Positional[Path]
-    """CARMEN log, plain or .gz."""
+    """CARMEN log, plain or .gz; ROS 1 .bag; ROS 2 bag: its folder, .mcap or .db3."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="DIR")]
     """Folder for the map; made if it is not there."""
     pose_error: Literal["independent", "persistent", "unknown"] = "unknown"
@@ -48,21 +48,14 @@ class Build(LogOptions):
     def run(self) -> int:
         """Build the map, and give the exit status."""
         options = options_of_update(self) | {"pose_error": self.pose_error}
-        from linemap_jax.core.settings import Mount
         from linemap_jax.core.state import Status
-        from linemap_jax.io.log import open_log
         from linemap_jax.io.map_file import write_map
         from linemap_jax.io.plot import plot_map
 
         map_file, picture = self.output / "map.json", self.output / "map.png"
         check_output(self.output, map_file, picture, overwrite=self.overwrite)
-        log = open_log(self.log, strict=self.strict, range_max=self.range_max)
-        if self.laser_offset is not None and next(iter(log)).pose_frame == "laser":
-            options["mount"] = Mount()
-            say(
-                f"warning: {log.path}: its poses are the laser's, so that --laser-offset has no effect",
-                quiet=self.quiet,
-            )
+        log = opened(self, self.log)
+        options["mount"] = mount_of(self, log, quiet=self.quiet)
         with progress(log, quiet=self.quiet):
             line_map, report, positions, seconds, interrupted = _map_of_log(self, log, options)
         warn(log, quiet=self.quiet)
@@ -88,7 +81,8 @@ class Build(LogOptions):
         if interrupted:
             print(f"linemap: interrupted; the map so far is in {self.output}", file=sys.stderr)
             return 130
-        summary = _summary(self, line_map, report, options, seconds) | {"map": str(map_file), "picture": str(picture)}
+        summary = _summary(self, line_map, report, options, seconds)
+        summary |= {"poses": tell_poses(self, log), "map": str(map_file), "picture": str(picture)}
         print(json.dumps(summary, indent=2) if self.json else _in_words(summary))
         return 0
 
@@ -171,13 +165,12 @@ def _summary(
     import numpy as np
 
     from linemap_jax.build import CHUNK
-    from linemap_jax.io.log import open_log
     from linemap_jax.lab.evaluation import duplicates, explained_share
 
     # Evenly spread scans are enough for a share, and on a long log save a third of the time.
     scans = int(report.status.shape[0])
     seldom = dataclasses.replace(command, every=command.every * -(-scans // SCANS_EXPLAINED))
-    log = open_log(command.log, strict=command.strict, range_max=command.range_max)
+    log = opened(command, command.log)
     chunks = ((chunk.scans, chunk.poses) for chunk in chunks_of_log(seldom, log, CHUNK))
     share = explained_share(line_map, chunks, options["mount"], chunk=CHUNK)
     lines = line_map.lines
@@ -207,6 +200,7 @@ def _in_words(summary: dict[str, Any]) -> str:
         f"{summary['explained']:.1%} of the returns under 20 m lie within 10 cm of them; "
         f"median line {summary['median_line_length_m']:.2f} m, {summary['duplicates']} duplicate lines\n"
         f"{summary['seconds_to_first_chunk']:.1f} s to compile, {then}\n"
+        f"poses:   {summary['poses']}\n"
         f"map:     {summary['map']}\n"
         f"picture: {summary['picture']}"
     )

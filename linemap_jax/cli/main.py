@@ -10,6 +10,7 @@ from linemap_jax.cli.calibrate import Calibrate
 from linemap_jax.cli.config import Config
 from linemap_jax.cli.evaluate import Evaluate
 from linemap_jax.cli.extract import Extract
+from linemap_jax.cli.info import Info
 from linemap_jax.cli.options import UsageError
 from linemap_jax.cli.simulate import Simulate
 from linemap_jax.cli.trials import Trials
@@ -19,6 +20,7 @@ Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Build, tyro.conf.subcommand("build")]
     | Annotated[Extract, tyro.conf.subcommand("extract")]
+    | Annotated[Info, tyro.conf.subcommand("info")]
     | Annotated[Simulate, tyro.conf.subcommand("simulate")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Trials, tyro.conf.subcommand("trials")]
