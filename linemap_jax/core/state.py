@@ -57,6 +57,20 @@ class Status(enum.IntFlag):
     """The pose or its covariance held NaN or infinity; the scan was left out."""
 
 
+@jax.jit  # step by step, some thirty operations would be compiled one by one
+def _judged(
+    r: Float[Array, " N"], b: Float[Array, " N"], range_min: ArrayLike, range_max: ArrayLike
+) -> dict[str, Array]:
+    """The fields of `Scan.from_ranges`."""
+    finite = jnp.isfinite(b)
+    valid = jnp.isfinite(r) & (r > 0) & (r >= range_min) & (r < range_max) & finite
+    step = jnp.abs(jnp.diff(b)) if r.size > 1 else jnp.zeros(1, r.dtype)
+    spacing = jnp.nan_to_num(jnp.nanmedian(jnp.where(jnp.isfinite(step), step, jnp.nan))).astype(r.dtype)
+    r, b = jnp.where(valid, r, 0), jnp.where(finite, b, 0)
+    valid, first = close_sweep(r, b, valid, spacing)
+    return {"ranges": jnp.where(valid, r, 0), "bearings": b, "valid": valid, "spacing": spacing, "first": first}
+
+
 @pytree
 class Scan:
     """One range scan in the frame of the sensor.
@@ -95,13 +109,7 @@ class Scan:
         b = jnp.asarray(bearings, r.dtype)
         if r.ndim != 1 or r.shape != b.shape:
             raise ValueError(f"ranges {r.shape} and bearings {b.shape} must be one-dimensional and of one length")
-        finite = jnp.isfinite(b)
-        valid = jnp.isfinite(r) & (r > 0) & (r >= range_min) & (r < range_max) & finite
-        step = jnp.abs(jnp.diff(b)) if r.size > 1 else jnp.zeros(1, r.dtype)
-        spacing = jnp.nan_to_num(jnp.nanmedian(jnp.where(jnp.isfinite(step), step, jnp.nan))).astype(r.dtype)
-        r, b = jnp.where(valid, r, 0), jnp.where(finite, b, 0)
-        valid, first = close_sweep(r, b, valid, spacing)
-        return cls(ranges=jnp.where(valid, r, 0), bearings=b, valid=valid, spacing=spacing, first=first)
+        return cls(**_judged(r, b, range_min, range_max))
 
 
 @pytree
