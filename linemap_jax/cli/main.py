@@ -8,6 +8,7 @@ import tyro
 from linemap_jax.cli.build import Build, Demo
 from linemap_jax.cli.calibrate import Calibrate
 from linemap_jax.cli.evaluate import Evaluate
+from linemap_jax.cli.export import Export
 from linemap_jax.cli.extract import Extract
 from linemap_jax.cli.options import UsageError
 from linemap_jax.cli.simulate import Simulate
@@ -18,6 +19,7 @@ Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Build, tyro.conf.subcommand("build")]
     | Annotated[Extract, tyro.conf.subcommand("extract")]
+    | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Simulate, tyro.conf.subcommand("simulate")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Trials, tyro.conf.subcommand("trials")]

@@ -175,7 +175,9 @@ def _draw_circles(axes: Axes, circles: Circles, colour: ScalarMappable, level: f
     center, radius, fitted = (np.asarray(x) for x in (circles.center, circles.radius, circles.fitted))
     edges = np.asarray(colour.to_rgba(np.asarray(circles.times_detected)))
     faces = edges * np.where(fitted[:, None], [1, 1, 1, 0.35], [1, 1, 1, 0])
-    axes.add_collection(PolyCollection(list(outlines(center, radius)), facecolors=faces, edgecolors=edges, linewidths=0.9, zorder=4))
+    axes.add_collection(
+        PolyCollection(list(outlines(center, radius)), facecolors=faces, edgecolors=edges, linewidths=0.9, zorder=4)
+    )
 
     handles: list[Any] = []
     if not fitted.all():
