@@ -17,16 +17,17 @@ from plotly import io as plotly_io
 from linemap_jax.core.state import LineMap
 from linemap_jax.io.atomic import atomic_write
 from linemap_jax.io.map_file import Columns, columns_of_circles, columns_of_lines
-from linemap_jax.io.shapes import LEVEL, Floats, outlines, shapes_of_map
+from linemap_jax.io.shapes import LEVEL, Floats, outlines, shapes_of_map, sound
 
 MOST_POINTS = 8_000
 """Raw points on the page."""
-MOST_NUMBERS = 900_000
+MOST_NUMBERS = 1_200_000
 """Numbers of all moments together: five bytes each, beside the five megabytes of the program."""
 
 _BAND_STEPS, _CIRCLE_STEPS = 5, 20
 _HOVER_STEP, _MOST_HOVER = 0.5, 16  # m between the places of a line that answer to the pointer; how many at most
 _MOST_PLACES = 1_000  # of the path
+_NO_BUTTONS = ["sendChartToCloud", "select2d", "lasso2d"]
 _INK, _SOFT, _GRID = "#262626", "#6B6B6B", "#E6E6E6"
 
 
@@ -64,7 +65,12 @@ def write_html(
     figure = figure_of_moments(moments, trajectory, points, title=title, level=level)
     body = plotly_io.to_html(
         figure,
-        config={"scrollZoom": True, "displaylogo": False, "toImageButtonOptions": {"format": "svg"}},
+        config={
+            "scrollZoom": True,
+            "displaylogo": False,
+            "modeBarButtonsToRemove": _NO_BUTTONS,
+            "toImageButtonOptions": {"format": "svg"},
+        },
         include_plotlyjs=True,
         full_html=False,
         auto_play=False,
@@ -97,7 +103,7 @@ def figure_of_moments(
         x=_small(raw[:, 0]),
         y=_small(raw[:, 1]),
         mode="markers",
-        marker={"size": 2, "color": "#B0B0B0"},
+        marker={"size": 3, "color": "#9A9A9A"},
         name="raw points",
         hoverinfo="skip",
         visible=True if len(raw) else "legendonly",
@@ -110,7 +116,7 @@ def figure_of_moments(
             name=str(moments[i].scans),
             traces=changing,
             data=[
-                {name: trace[name] for name in ("x", "y", "customdata") if trace[name] is not None}
+                {name: trace[name] for name in ("x", "y", "customdata", "text") if trace[name] is not None}
                 for trace in shown[i]
             ],
         )
@@ -129,7 +135,7 @@ def figure_of_moments(
         hoverlabel={"align": "left"},
         dragmode="pan",
         margin={"l": 60, "r": 20, "t": 70, "b": 20},
-        legend={"itemsizing": "constant"},
+        legend={"itemsizing": "constant", "tracegroupgap": 0},
         sliders=[_slider(figure.frames)] if figure.frames else [],
     )
     return figure
@@ -152,20 +158,25 @@ def _slider(frames: Sequence[go.Frame]) -> dict[str, Any]:
 def _traces(moment: Moment, path: Floats, level: float) -> list[go.Scatter]:
     """The layers of one moment, the lowest first."""
     shapes = shapes_of_map(moment.line_map, level, band_steps=_BAND_STEPS, circle_steps=_CIRCLE_STEPS)
-    lines, circles = columns_of_lines(moment.line_map.lines), columns_of_circles(moment.line_map.circles)
+    lines, circles = sound(moment.line_map.lines), sound(moment.line_map.circles)
+    lines, circles = columns_of_lines(lines), columns_of_circles(circles)
     percent = f"{level * 100:g} %"
-    orange = {"fill": "toself", "fillcolor": "rgba(230, 159, 0, 0.5)", "mode": "lines", "hoverinfo": "skip"}
+    orange: dict[str, Any] = {
+        "fill": "toself",
+        "fillcolor": "rgba(230, 159, 0, 0.5)",
+        "mode": "lines",
+        "hoverinfo": "skip",
+    }
     driven = path[: moment.scans]
     driven = np.concatenate([driven[:: max(1, -(-len(path) // _MOST_PLACES))], driven[-1:]])
     at, told_of_line = _places_of_lines(shapes.segments, lines)
-    rims, told_of_circle = _places_of_circles(shapes.center, shapes.radius, circles)
     return [
         _trace(_closed(shapes.bands), f"{percent} confidence bands", line={"width": 0}, **orange),
         _trace(
             driven,
             "path of the robot",
             mode="lines",
-            line={"color": "#8A8A8A", "width": 1, "dash": "dash"},
+            line={"color": "#8A8A8A", "width": 1.2},
             hoverinfo="skip",
         ),
         _trace(
@@ -179,14 +190,23 @@ def _traces(moment: Moment, path: Floats, level: float) -> list[go.Scatter]:
             "detected %{customdata[5]:.0f} times<extra></extra>",
         ),
         _trace(
-            rims,
+            _closed(outlines(shapes.center, shapes.radius, _CIRCLE_STEPS)),
             "circles",
             mode="lines",
             line={"color": "#2171B5", "width": 1.5},
-            customdata=told_of_circle,
-            hovertemplate="<b>circle</b><br>at (%{customdata[0]:.3f}, %{customdata[1]:.3f}) m<br>"
-            "radius %{customdata[2]:.3f} m<br>sigma of x, y, radius: %{customdata[3]:.3f}, %{customdata[4]:.3f}, "
-            "%{customdata[5]:.3f} m<br>detected %{customdata[6]:.0f} times<extra></extra>",
+            legendgroup="circles",
+            hoverinfo="skip",
+        ),
+        # What answers to the pointer: nothing to be seen, at the centres
+        _trace(
+            shapes.center,
+            "circles",
+            mode="markers",
+            marker={"opacity": 0, "size": 8, "color": "#2171B5"},
+            legendgroup="circles",
+            showlegend=False,
+            text=_told_of_circles(circles),
+            hovertemplate="%{text}<extra></extra>",
         ),
         _trace(
             _closed(shapes.ellipses), f"{percent} confidence ellipses", line={"width": 1, "color": "#E69F00"}, **orange
@@ -194,13 +214,15 @@ def _traces(moment: Moment, path: Floats, level: float) -> list[go.Scatter]:
     ]
 
 
-def _trace(places: Floats, name: str, customdata: Floats | None = None, **style: Any) -> go.Scatter:
+def _trace(places: Floats, name: str, *, customdata: Floats | None = None, **style: Any) -> go.Scatter:
     told = None if customdata is None else _small(customdata)
     return go.Scatter(x=_small(places[:, 0]), y=_small(places[:, 1]), name=name, customdata=told, **style)
 
 
 def _size(trace: go.Scatter) -> int:
-    return sum(np.size(trace[name]) for name in ("x", "y", "customdata") if trace[name] is not None)
+    """About how many numbers a trace is; a letter is a fifth of one."""
+    numbers: list[Any] = [trace[name] for name in ("x", "y", "customdata")]
+    return sum(np.size(x) for x in numbers if x is not None) + sum(map(len, trace["text"] or ())) // 5
 
 
 def _small(numbers: Floats) -> NDArray[np.float32]:
@@ -226,13 +248,16 @@ def _places_of_lines(segments: Floats, columns: Columns) -> tuple[Floats, Floats
     return (1 - share) * segments[line, 0] + share * segments[line, 1], np.stack(told, -1).astype(float)[line]
 
 
-def _places_of_circles(center: Floats, radius: Floats, columns: Columns) -> tuple[Floats, Floats]:
-    """The rim of each circle, a gap after each; and for each place what the circle is. No sigma where none is known."""
-    rims = _closed(outlines(center, radius, _CIRCLE_STEPS))
-    variance = np.diagonal(columns["cov"], axis1=1, axis2=2)
-    sigma = np.where(columns["fitted"][:, None], np.sqrt(variance), np.nan)
-    told = np.column_stack([center, radius, sigma, columns["times_detected"]]).astype(float)
-    return rims, np.repeat(told, _CIRCLE_STEPS + 2, 0)
+def _told_of_circles(columns: Columns) -> list[str]:
+    """What each circle is; its accuracy only where it is known."""
+    sigma = np.sqrt(np.diagonal(columns["cov"], axis1=1, axis2=2))
+    names = ("center", "radius", "times_detected", "fitted")
+    return [
+        f"<b>{'fitted circle' if fitted else 'cluster of points'}</b><br>at ({x:.3f}, {y:.3f}) m<br>radius {radius:.3f} m<br>"
+        + ("sigma of x, y, radius: {:.3f}, {:.3f}, {:.3f} m<br>".format(*each) if fitted else "")
+        + f"detected {times} times"
+        for (x, y), radius, times, fitted, each in zip(*(columns[name].tolist() for name in names), sigma, strict=True)
+    ]
 
 
 def _ragged(count: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:

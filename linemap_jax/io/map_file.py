@@ -84,7 +84,7 @@ def write_map(
             "format": FORMAT,
             "version": VERSION,
             "dtype": str(line_map.lines.offset.dtype),
-            "settings": _plain(settings, "settings"),
+            "settings": plain_settings(settings),
             "lines": _entries_of_lines(line_map.lines),
             "circles": _entries_of_circles(line_map.circles),
         }
@@ -196,6 +196,11 @@ def _plain_numbers(array: NDArray[Any]) -> Any:
     return array.tolist()
 
 
+def plain_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings as a map file holds them: in numbers, strings, lists and mappings alone."""
+    return _plain(settings, "settings")
+
+
 def _plain(value: Any, where: str) -> Any:
     """The value in JSON's own types."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -262,7 +267,7 @@ def _load(path: str | os.PathLike[str]) -> dict[str, Any]:
         raise _Fault('"dtype" must be "float32" or "float64"')
     if not isinstance(document.get("settings"), dict):
         raise _Fault('"settings" must be an object')
-    document["settings"] = _plain(document["settings"], "settings")
+    document["settings"] = plain_settings(document["settings"])
     return document
 
 

@@ -3,6 +3,7 @@
 NumPy in float64, in metres. Free slots and whatever is not finite are left out first, with `used`.
 """
 
+import dataclasses
 import math
 from statistics import NormalDist
 from typing import NamedTuple
@@ -61,10 +62,16 @@ def shapes_of_map(
 
 def used(slots: SlotsT) -> SlotsT:
     """The lines or circles without free slots and without any that hold NaN or infinity; leaves are NumPy arrays."""
+    keep = np.asarray(sound(slots).valid)
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[keep], slots)
+
+
+def sound(slots: SlotsT) -> SlotsT:
+    """The same slots, free where something is NaN or infinite."""
     keep = np.array(slots.valid)
     for leaf in jax.tree.leaves(slots):
         keep &= np.isfinite(np.asarray(leaf)).reshape(keep.size, -1).all(1)
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[keep], slots)
+    return dataclasses.replace(slots, valid=keep)
 
 
 def segments(lines: Lines) -> Floats:

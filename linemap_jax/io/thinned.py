@@ -1,7 +1,9 @@
 """A stream of unknown length in a list of bounded length."""
 
 from collections.abc import Sequence
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
+
+from numpy.typing import NDArray
 
 T = TypeVar("T")
 
@@ -20,7 +22,7 @@ class Thinned(Generic[T]):
         self.every = 1
         self._most, self._seen = most, 0
 
-    def extend(self, items: Sequence[T]) -> None:
+    def extend(self, items: Sequence[T] | NDArray[Any]) -> None:
         """The next items of the stream."""
         self.kept.extend(items[-self._seen % self.every :: self.every])
         self._seen += len(items)

@@ -52,7 +52,7 @@ def returns_in_world(
     """
     placed = mount or Mount()
     mean = np.asarray(poses.mean, float)
-    finite = np.isfinite(mean).all(-1)
+    finite = np.asarray(np.isfinite(mean).all(-1))
     x, y, theta = np.where(finite[:, None], mean, 0).T
     cos, sin = np.cos(theta), np.sin(theta)
     mx, my = float(placed.x), float(placed.y)
