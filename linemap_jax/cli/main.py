@@ -10,6 +10,7 @@ from linemap_jax.cli.calibrate import Calibrate
 from linemap_jax.cli.evaluate import Evaluate
 from linemap_jax.cli.export import Export
 from linemap_jax.cli.extract import Extract
+from linemap_jax.cli.merge import Merge
 from linemap_jax.cli.options import UsageError
 from linemap_jax.cli.simulate import Simulate
 from linemap_jax.cli.trials import Trials
@@ -20,6 +21,7 @@ Command = (
     | Annotated[Build, tyro.conf.subcommand("build")]
     | Annotated[Extract, tyro.conf.subcommand("extract")]
     | Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[Merge, tyro.conf.subcommand("merge")]
     | Annotated[Simulate, tyro.conf.subcommand("simulate")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Trials, tyro.conf.subcommand("trials")]

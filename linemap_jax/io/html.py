@@ -253,7 +253,8 @@ def _told_of_circles(columns: Columns) -> list[str]:
     sigma = np.sqrt(np.diagonal(columns["cov"], axis1=1, axis2=2))
     names = ("center", "radius", "times_detected", "fitted")
     return [
-        f"<b>{'fitted circle' if fitted else 'cluster of points'}</b><br>at ({x:.3f}, {y:.3f}) m<br>radius {radius:.3f} m<br>"
+        f"<b>{'fitted circle' if fitted else 'cluster of points'}</b><br>at ({x:.3f}, {y:.3f}) m<br>"
+        f"radius {radius:.3f} m<br>"
         + ("sigma of x, y, radius: {:.3f}, {:.3f}, {:.3f} m<br>".format(*each) if fitted else "")
         + f"detected {times} times"
         for (x, y), radius, times, fitted, each in zip(*(columns[name].tolist() for name in names), sigma, strict=True)
