@@ -7,6 +7,7 @@ import tyro
 
 from linemap_jax.cli.build import Build, Demo
 from linemap_jax.cli.calibrate import Calibrate
+from linemap_jax.cli.compare import Compare
 from linemap_jax.cli.evaluate import Evaluate
 from linemap_jax.cli.export import Export
 from linemap_jax.cli.extract import Extract
@@ -22,6 +23,7 @@ Command = (
     | Annotated[Extract, tyro.conf.subcommand("extract")]
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Merge, tyro.conf.subcommand("merge")]
+    | Annotated[Compare, tyro.conf.subcommand("compare")]
     | Annotated[Simulate, tyro.conf.subcommand("simulate")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Trials, tyro.conf.subcommand("trials")]
