@@ -124,12 +124,18 @@ def figure_of_moments(
     ]
     last = moments[-1].line_map
     counts = f"{int(np.asarray(last.lines.valid).sum())} lines, {int(np.asarray(last.circles.valid).sum())} circles"
+    # The view is that of the whole map, and stays where it is put: moments and layers do not move it.
+    places = np.concatenate([np.stack([trace.x, trace.y], -1) for trace in figure.data])
+    places = places[np.isfinite(places).all(-1)] if len(places) else places
+    low, high = (places.min(0), places.max(0)) if len(places) else (np.full(2, -2.5), np.full(2, 2.5))
+    margin = 0.04 * (high - low).max() + 0.1
+    ranges = np.stack([low - margin, high + margin], -1).tolist()
     axis = {"gridcolor": _GRID, "zeroline": False, "ticksuffix": " m", "tickfont": {"color": _SOFT}}
     figure.update_layout(
         title={"text": f"<b>{html.escape(title)}</b><br><sup>{counts}</sup>", "font": {"color": _INK}, "x": 0.01},
         font={"family": "sans-serif", "size": 13, "color": _INK},
-        xaxis=axis,
-        yaxis=axis | {"scaleanchor": "x"},
+        xaxis=axis | {"range": ranges[0]},
+        yaxis=axis | {"range": ranges[1], "scaleanchor": "x"},
         plot_bgcolor="white",
         hovermode="closest",
         hoverlabel={"align": "left"},

@@ -23,7 +23,7 @@ through cells of it, so one half would be too much."""
 MOST_CELLS = 64_000_000
 """Of a grid: 400 m by 400 m at 5 cm, half a gigabyte while it is counted."""
 
-_FRACTION = 16  # bits after the point, of positions along a beam
+_FRACTION = 32  # bits after the point, of positions along a beam
 _HALF = 1 << (_FRACTION - 1)
 
 Chunks = Iterable[tuple[Scan, Pose]]
@@ -122,7 +122,8 @@ def _pass(
     length = np.abs(step).max(-1, initial=0)
     order = np.argsort(-length, kind="stable")
     length, first, step = length[order], first[order], step[order]
-    place = (first << _FRACTION) + _HALF
+    # In fixed point. What the steps lack, less than a unit each, stands in the start, so that halves are rounded up.
+    place = (first << _FRACTION) + _HALF + length[:, None]
     step = (step << _FRACTION) // np.maximum(length, 1)[:, None]
     x, y = np.ascontiguousarray(place[:, 0]), np.ascontiguousarray(place[:, 1])
     by_x, by_y = np.ascontiguousarray(step[:, 0]), np.ascontiguousarray(step[:, 1])
