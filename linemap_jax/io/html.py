@@ -125,7 +125,8 @@ def figure_of_moments(
     last = moments[-1].line_map
     counts = f"{int(np.asarray(last.lines.valid).sum())} lines, {int(np.asarray(last.circles.valid).sum())} circles"
     # The view is that of the whole map, and stays where it is put: moments and layers do not move it.
-    places = np.concatenate([np.stack([trace.x, trace.y], -1) for trace in figure.data])
+    traces: list[Any] = [behind, *shown[-1]]
+    places = np.concatenate([np.stack([trace.x, trace.y], -1) for trace in traces])
     places = places[np.isfinite(places).all(-1)] if len(places) else places
     low, high = (places.min(0), places.max(0)) if len(places) else (np.full(2, -2.5), np.full(2, 2.5))
     margin = 0.04 * (high - low).max() + 0.1

@@ -84,14 +84,14 @@ def compare_maps(
       within: how far a thing may have moved, m; farther away it is another one.
       alpha: probability of telling of a movement where there is none.
       shortest: shortest piece of a line that is told to have vanished or appeared, m.
-      at_least: lines and circles that were detected more seldom are passed over.
+      at_least: changes of lines and circles that were detected more seldom are not told.
 
     Returns:
       The changes: what has moved, most surely first; what has vanished and what has appeared, the longest first.
     """
-    lines_a, lines_b = (_seen(m.lines, at_least) for m in (a, b))
-    pairs = _line_pairs(lines_a, lines_b, within)
-    circle_pairs = _circle_pairs(a, b, within, at_least)
+    lines_a, lines_b = (_Walls(*map(np.asarray, _walls(m.lines))) for m in (a, b))
+    pairs = _line_pairs(a.lines, b.lines, lines_a, lines_b, within)
+    circle_pairs = _circle_pairs(a, b, within)
     # One family of tests. Of circles without a covariance those near each other are the same.
     fitted = circle_pairs.near & ~np.isnan(circle_pairs.p)
     raw = np.concatenate([pairs.p[pairs.near], circle_pairs.p[fitted]])
@@ -103,15 +103,18 @@ def compare_maps(
     moved = list(_nearest_first(np.where(pairs.near, np.abs(pairs.offset), np.inf), free_a, free_b))
     slide, p_slide = _slides(lines_a, lines_b, same)
     slid = [(int(i), int(j)) for i, j in np.argwhere(p_slide < alpha)]
-    normal, tangent = (np.asarray(x, float) for x in (lines_a.normal, lines_a.tangent))
     changes = [
-        _moved_line(lines_a, lines_b, pairs, at, pairs.offset[at] * normal[at[0]], p_line[at]) for at in moved
-    ] + [_moved_line(lines_a, lines_b, pairs, at, slide[at] * tangent[at[0]], p_slide[at]) for at in slid]
+        *(
+            _moved_line(lines_a, lines_b, pairs, at, pairs.offset[at] * lines_a.normal[at[0]], p_line[at])
+            for at in moved
+        ),
+        *(_moved_line(lines_a, lines_b, pairs, at, slide[at] * lines_a.tangent[at[0]], p_slide[at]) for at in slid),
+    ]
     moved_a, moved_b = ({at[side] for at in moved + slid} for side in (0, 1))
     changes += _missing_lines("vanished", lines_a, lines_b, same, moved_a, shortest)
     changes += _missing_lines("appeared", lines_b, lines_a, same.T, moved_b, shortest)
-    found, same_circles = _circle_changes(a, b, circle_pairs, p_circle, alpha, at_least)
-    changes += found
+    found, same_circles = _circle_changes(a, b, circle_pairs, p_circle, alpha)
+    changes = [change for change in changes + found if change.times_detected >= at_least]
     order = {"moved": 0, "vanished": 1, "appeared": 2}
 
     def rank(change: Change) -> tuple[int, float, float]:
@@ -171,6 +174,40 @@ def looked_through(
     return told
 
 
+class _Walls(NamedTuple):
+    """Lines as arrays of NumPy."""
+
+    anchor: Float[np.ndarray, "K 2"]  # m
+    foot: Float[np.ndarray, "K 2"]  # m, on the line, where the extent counts from
+    normal: Float[np.ndarray, "K 2"]
+    tangent: Float[np.ndarray, "K 2"]
+    begin: Float[np.ndarray, "K 2"]  # m
+    end: Float[np.ndarray, "K 2"]  # m
+    extent: Float[np.ndarray, "K 2"]  # m
+    var_extent: Float[np.ndarray, "K 2"]  # m^2
+    var_offset: Float[np.ndarray, " K"]  # m^2
+    times: Int[np.ndarray, " K"]
+    valid: Bool[np.ndarray, " K"]
+
+
+@jax.jit
+def _walls(lines: Lines) -> tuple[Array, ...]:
+    """The fields of `_Walls`."""
+    return (
+        lines.anchor,
+        lines.point_at(jnp.zeros_like(lines.offset)),
+        lines.normal,
+        lines.tangent,
+        lines.begin,
+        lines.end,
+        lines.extent,
+        lines.var_extent,
+        lines.cov[:, 0, 0],
+        lines.times_detected,
+        lines.valid,
+    )
+
+
 class _Pairs(NamedTuple):
     """Each line of one map against each of the other, `[K, L]`."""
 
@@ -193,56 +230,46 @@ def _hold_against(a: Lines, b: Lines) -> tuple[LineComparison, Array]:
     return jax.vmap(jax.vmap(one, (None, 0)), (0, None))(a, b)
 
 
-def _line_pairs(a: Lines, b: Lines, within: float) -> _Pairs:
+def _line_pairs(a: Lines, b: Lines, walls_a: _Walls, walls_b: _Walls, within: float) -> _Pairs:
     pair, sigma = _hold_against(a, b)
     offset, turn, nis, gap, sigma = (np.asarray(x, float) for x in (pair.offset, pair.angle, pair.nis, pair.gap, sigma))
-    length_a, length_b = (np.asarray(x.length, float) for x in (a, b))
-    near = np.asarray(a.valid)[:, None] & np.asarray(b.valid)[None]
-    near = near & (np.abs(turn) <= FARTHEST_TURN) & (np.abs(offset) <= within)
+    length_a, length_b = (walls.extent[:, 1] - walls.extent[:, 0] for walls in (walls_a, walls_b))
+    near = walls_a.valid[:, None] & walls_b.valid[None] & (np.abs(turn) <= FARTHEST_TURN) & (np.abs(offset) <= within)
     near = near & (-gap >= OVERLAP * np.minimum(length_a[:, None], length_b[None]))
     # chi-square with 2 degrees of freedom: P(d^2 > x) = exp(-x / 2)
     return _Pairs(near, offset, turn, sigma, np.exp(-nis / 2))
 
 
 def _slides(
-    a: Lines, b: Lines, same: Bool[np.ndarray, "K L"]
+    a: _Walls, b: _Walls, same: Bool[np.ndarray, "K L"]
 ) -> tuple[Float[np.ndarray, "K L"], Float[np.ndarray, "K L"]]:
-    """How far a line has moved along itself, m, with p-values of Holm; 1 for pairs of which that cannot be said.
+    """How far a line has moved along itself, m, with p-values; 1 for pairs of which that cannot be said.
 
     Both ends have to be seen, and to have moved alike: a line that has become longer was seen farther. Of the position
     along a line the map tells no covariance but that of its ends; so that of the offset is added, which holds what the
-    pose contributes.
+    pose contributes. The p-values are those of Bonferroni, among all pairs that are the same line.
     """
     slide, p = np.zeros(same.shape), np.ones(same.shape)
-    tested = []
     for i, j in np.argwhere(same & (same.sum(1) == 1)[:, None] & (same.sum(0) == 1)[None]).tolist():
-        ends = _along(a, i, b, j)
-        step = ends - np.asarray(a.extent, float)[i]
-        reverse = float(dot(a.tangent[i], b.tangent[j])) < 0
-        var = np.asarray(a.var_extent, float)[i] + np.asarray(b.var_extent, float)[j][:: -1 if reverse else 1]
-        spread = float(np.asarray(a.cov, float)[i, 0, 0] + np.asarray(b.cov, float)[j, 0, 0])
-        if abs(step[1] - step[0]) > END_SIGMAS * math.sqrt(var.sum()) + END_SLACK / 2:
-            continue
+        step = _along(a, i, b, j) - a.extent[i]
+        reverse = a.tangent[i] @ b.tangent[j] < 0
+        var = a.var_extent[i] + b.var_extent[j][:: -1 if reverse else 1]
+        longer = abs(step[1] - step[0]) > END_SIGMAS * math.sqrt(var.sum()) + END_SLACK / 2
         slide[i, j] = step.mean()
-        if abs(slide[i, j]) <= END_SLACK:
+        if longer or abs(slide[i, j]) <= END_SLACK:
             continue
-        tested.append((i, j))
-        p[i, j] = math.erfc(abs(slide[i, j]) / math.sqrt(2 * (var.sum() / 4 + spread)))
-    if tested:
-        where = tuple(np.transpose(tested))
-        p[where] = np.minimum(1, p[where] * max(1, int(same.sum())))
+        variance = var.sum() / 4 + a.var_offset[i] + b.var_offset[j]
+        p[i, j] = min(1.0, same.sum() * math.erfc(abs(slide[i, j]) / math.sqrt(2 * variance)))
     return slide, p
 
 
-def _along(a: Lines, i: int, b: Lines, j: int) -> Float[np.ndarray, "2"]:
+def _along(a: _Walls, i: int, b: _Walls, j: int) -> Float[np.ndarray, "2"]:
     """The ends of line `j` of `b` in coordinates along line `i` of `a`, the lower one first, m."""
-    anchor, tangent = np.asarray(a.anchor, float)[i], np.asarray(a.tangent, float)[i]
-    ends = np.stack([np.asarray(x, float)[j] for x in (b.begin, b.end)])
-    return np.sort((ends - anchor) @ tangent)
+    return np.sort((np.stack([b.begin[j], b.end[j]]) - a.anchor[i]) @ a.tangent[i])
 
 
 def _moved_line(
-    a: Lines, b: Lines, pairs: _Pairs, at: tuple[int, int], shift: Float[np.ndarray, "2"], p: float
+    a: _Walls, b: _Walls, pairs: _Pairs, at: tuple[int, int], shift: Float[np.ndarray, "2"], p: float
 ) -> Change:
     i, j = at
     return Change(
@@ -250,10 +277,10 @@ def _moved_line(
         kind="line",
         slot_a=i,
         slot_b=j,
-        begin=_pair(np.asarray(a.begin, float)[i]),
-        end=_pair(np.asarray(a.end, float)[i]),
+        begin=_pair(a.begin[i]),
+        end=_pair(a.end[i]),
         radius=None,
-        times_detected=min(int(a.times_detected[i]), int(b.times_detected[j])),
+        times_detected=min(int(a.times[i]), int(b.times[j])),
         shift=_pair(shift),
         sigma=float(pairs.sigma[at]),
         turn=float(pairs.turn[at]),
@@ -279,41 +306,36 @@ def _nearest_first(
 
 def _missing_lines(
     what: Literal["vanished", "appeared"],
-    lines: Lines,
-    others: Lines,
+    lines: _Walls,
+    others: _Walls,
     same: Bool[np.ndarray, "K L"],
     moved: set[int],
     shortest: float,
 ) -> Iterator[Change]:
     """The pieces of lines that no line of the other map covers."""
-    extent, reach = (
-        np.asarray(lines.extent, float),
-        END_SIGMAS * np.sqrt(np.asarray(lines.var_extent, float)) + END_SLACK,
-    )
-    foot = np.asarray(lines.anchor, float) + np.asarray(lines.offset, float)[:, None] * np.asarray(lines.normal, float)
-    tangent, times = np.asarray(lines.tangent, float), np.asarray(lines.times_detected)
-    for i in np.flatnonzero(np.asarray(lines.valid)).tolist():
+    reach = END_SIGMAS * np.sqrt(lines.var_extent.max(-1)) + END_SLACK
+    for i in np.flatnonzero(lines.valid).tolist():
         if i in moved:
             continue
         held = sorted(_along(lines, i, others, j).tolist() for j in np.flatnonzero(same[i]).tolist())
-        gaps, at = [], extent[i, 0]
+        gaps, at = [], lines.extent[i, 0]
         for low, high in held:
             gaps.append((at, low))
             at = max(at, high)
-        gaps.append((at, extent[i, 1]))
-        least = shortest + reach[i].max() if held else 0.0
+        gaps.append((at, lines.extent[i, 1]))
+        least = shortest + reach[i] if held else 0.0
         for low, high in gaps:
-            high = min(high, extent[i, 1])
+            high = min(high, lines.extent[i, 1])
             if high - low > least:
                 yield Change(
                     what=what,
                     kind="line",
                     slot_a=i if what == "vanished" else None,
                     slot_b=i if what == "appeared" else None,
-                    begin=_pair(foot[i] + low * tangent[i]),
-                    end=_pair(foot[i] + high * tangent[i]),
+                    begin=_pair(lines.foot[i] + low * lines.tangent[i]),
+                    end=_pair(lines.foot[i] + high * lines.tangent[i]),
                     radius=None,
-                    times_detected=int(times[i]),
+                    times_detected=int(lines.times[i]),
                 )
 
 
@@ -326,15 +348,13 @@ class _CirclePairs(NamedTuple):
     p: Float[np.ndarray, "C D"]  # NaN where one of the two is not fitted
 
 
-def _circle_pairs(a: LineMap, b: LineMap, within: float, at_least: int) -> _CirclePairs:
+def _circle_pairs(a: LineMap, b: LineMap, within: float) -> _CirclePairs:
     one, other = a.circles, b.circles
-    valid = [np.asarray(x.valid) & (np.asarray(x.times_detected) >= at_least) for x in (one, other)]
     shift = np.asarray(other.center, float)[None] - np.asarray(one.center, float)[:, None]
     distance = np.linalg.norm(shift, axis=-1)
     fitted = np.asarray(one.fitted)[:, None] & np.asarray(other.fitted)[None]
-    near = (
-        valid[0][:, None] & valid[1][None] & (distance <= np.where(fitted, within, Thresholds().circle_match_distance))
-    )
+    near = np.asarray(one.valid)[:, None] & np.asarray(other.valid)[None]
+    near = near & (distance <= np.where(fitted, within, Thresholds().circle_match_distance))
     cov = np.asarray(one.cov, float)[:, None, :2, :2] + np.asarray(other.cov, float)[None, :, :2, :2]
     cov = np.where((near & fitted)[..., None, None], cov, np.eye(2))
     nis = np.einsum("cdi,cdi->cd", shift, np.linalg.solve(cov, shift[..., None])[..., 0])
@@ -344,12 +364,11 @@ def _circle_pairs(a: LineMap, b: LineMap, within: float, at_least: int) -> _Circ
 
 
 def _circle_changes(
-    a: LineMap, b: LineMap, pairs: _CirclePairs, p: Float[np.ndarray, "C D"], alpha: float, at_least: int
+    a: LineMap, b: LineMap, pairs: _CirclePairs, p: Float[np.ndarray, "C D"], alpha: float
 ) -> tuple[list[Change], int]:
     """What has become of the circles; and how many of the first map the second holds too."""
     same = pairs.near & (p >= alpha)
-    valid = [np.asarray(x.valid) & (np.asarray(x.times_detected) >= at_least) for x in (a.circles, b.circles)]
-    free = [np.flatnonzero(v & ~same.any(axis)) for v, axis in zip(valid, (1, 0), strict=True)]
+    free = [np.flatnonzero(np.asarray(m.circles.valid) & ~same.any(axis)) for m, axis in ((a, 1), (b, 0))]
     moved = list(_nearest_first(np.where(pairs.near, np.linalg.norm(pairs.shift, axis=-1), np.inf), *free))
     changes = []
     parts: list[tuple[What, LineMap, list[int]]] = [
@@ -377,11 +396,6 @@ def _circle_changes(
                 )
             )
     return changes, int(same.any(1).sum())
-
-
-def _seen(lines: Lines, at_least: int) -> Lines:
-    """Those that were detected often enough."""
-    return dataclasses.replace(lines, valid=lines.valid & (lines.times_detected >= at_least))
 
 
 def _pair(point: Float[np.ndarray, "2"]) -> tuple[float, float]:
