@@ -12,6 +12,8 @@ import pytest
 from PIL import Image
 
 from linemap_jax.cli import main
+from linemap_jax.cli.resume import differences
+from linemap_jax.core.settings import PAPER_RULES, Rules, SensorNoise
 from linemap_jax.io.exports import FORMATS
 
 BEAMS, SCANS = 181, 12  # so many beams as in test_cli.py: another number would be compiled anew
@@ -117,13 +119,17 @@ def test_resumed_it_is_the_map_of_one_drive(built: Path, run: Any, tmp_path: Pat
         assert sorted(map(json.dumps, resumed[kind])) == sorted(map(json.dumps, whole[kind]))
     assert resumed["settings"]["resumed_from"] == "one.log"
 
-    # in place, and with a noise that the map was not built with
-    again = "--resume-from", tmp_path / "two/map.json", "-o", tmp_path / "two", "--overwrite"
-    status, _, err = run("build", second, *again, "--range-sigma", 0.03)
-    assert status == 0
-    assert err == (
-        f"linemap: warning: {tmp_path / 'two/map.json'} was built with other settings: "
-        "pose_sigma [0.005, 0.005, 0.002] (now [0.05, 0.05, 0.01]), noise.range_sigma 0.01 (now 0.03)\n"
+
+def test_other_settings_are_told() -> None:
+    noise = SensorNoise(range_sigma=0.01)
+    before = {"preset": "paper", "noise": noise, "pose_sigma": [0.05, 0.05, 0.01], "rules": Rules(merge=False)}
+    now = {"preset": "default", "noise": SensorNoise(), "pose_sigma": (0.05, 0.05, 0.01), "rules": Rules()}
+    told = "preset paper (now default), noise.range_sigma 0.01 (now 0.02), rules.merge False (now True)"
+    assert differences(before, now) == told
+    assert differences(now, now) == ""
+    assert differences({"merged": []}, now) == ""
+    assert differences(before | {"rules": PAPER_RULES}, now).endswith(
+        "rules.maximum_likelihood False (now True) and 9 more"
     )
 
 
@@ -158,12 +164,14 @@ def test_maps_are_merged(built: Path, run: Any, tmp_path: Path) -> None:
     east = [line for line in merged["lines"] if line["rho"] == pytest.approx(4, abs=0.05) and abs(line["theta"]) < 0.05]
     assert [line["times_detected"] for line in east] == [2 * SCANS]
     assert (tmp_path / "ab/map.png").is_file()
-    assert "fused into others" in run("merge", built / "a/map.json", built / "b/map.json", "-o", tmp_path / "again")[1]
 
     far = document(built / "b/map.json")
-    far["lines"], far["circles"] = [], []
+    for line in far["lines"]:
+        for point in (line["anchor"], line["begin"], line["end"]):
+            point[0] += 100
     (tmp_path / "far.json").write_text(json.dumps(far))
-    _, _, err = run("merge", built / "a/map.json", tmp_path / "far.json", "-o", tmp_path / "far")
+    _, out, err = run("merge", built / "a/map.json", tmp_path / "far.json", "-o", tmp_path / "far")
+    assert "0 lines and 0 circles were fused into others" in out
     assert err.endswith("are both in one frame?\n")
 
 
