@@ -203,6 +203,9 @@ def test_what_is_refused(built: Path, refuse: Any, tmp_path: Path) -> None:
         assert refuse("export", good, "-o", tmp_path / "map", "--to", name) == (
             f"{name} is made from the scans of a log; give --log"
         )
+    assert refuse("export", good, "-o", tmp_path / "m.pgm", "--to", "nav2", "--log", log).endswith(
+        "name the .yaml file"
+    )
     assert "--resolution must be positive" in refuse("export", good, "-o", to, "--resolution", 0)
     assert "million cells" in refuse("export", good, "-o", tmp_path / "m.yaml", "--log", log, "--resolution", 1e-4)
     assert refuse("export", good, "-o", tmp_path / "none/map.svg").endswith("does not exist")

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from linemap_jax.io.atomic import atomic_write
+from linemap_jax.io.atomic import OutputError, atomic_write
 
 GREYS = {100: 0, 0: 254, -1: 205}
 """Of occupied, free and unknown cells, as `map_saver` writes them."""
@@ -28,7 +28,7 @@ def write_nav2(
       overwrite: whether older files may be replaced.
 
     Raises:
-      OutputError: if one of them exists and `overwrite` is false, or cannot be written.
+      OutputError: if one of them exists and `overwrite` is false, or cannot be written; if `path` is a .pgm.
     """
     values = np.asarray(cells)
     height, width = values.shape
@@ -36,6 +36,8 @@ def write_nav2(
     for value in (0, 100):
         grey[values == value] = GREYS[value]
     picture = Path(path).with_suffix(".pgm")
+    if picture == Path(path):
+        raise OutputError(f"{picture} is the place of the picture; name the .yaml file")
     x, y = np.asarray(origin, float).tolist()
     description = (
         f"image: {json.dumps(picture.name)}\n"  # a string of JSON is one of YAML
