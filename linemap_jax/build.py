@@ -170,8 +170,10 @@ def update_chunk(
 
     def step(line_map: LineMap, x: tuple[Scan, Pose, Array]) -> tuple[LineMap, Report]:
         scan, pose, is_active = x
-        scan = dataclasses.replace(scan, valid=scan.valid & is_active)
-        return update(line_map, scan, pose, **options)
+        look = partial(update, **options)
+        _, nothing = jax.eval_shape(look, line_map, scan, pose)
+        blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), nothing)
+        return jax.lax.cond(is_active, look, lambda line_map, *_: (line_map, blank), line_map, scan, pose)
 
     return jax.lax.scan(step, line_map, (scans, poses, active))
 

@@ -13,10 +13,13 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from bags import Recording
 
+from linemap_jax import PAPER_RULES, PAPER_THRESHOLDS, Rules, Thresholds
 from linemap_jax.cli import main
 from linemap_jax.cli.build import Build
 from linemap_jax.cli.extract import Extract
+from linemap_jax.io.config import read_config
 
 BEAMS = 181  # one number in the whole file: each other number would be compiled anew
 SCANS = 10
@@ -218,6 +221,19 @@ def test_config_goes_over_the_preset_and_options_over_both(run, log, tmp_path):
     assert document["lines"] == []  # the longest wall has 6 m
 
 
+def test_the_settings_come_as_a_file_that_is_read_back(run, refuse, tmp_path):
+    status, text, _ = run("config", "--preset", "paper", "--scanner", "pls")
+    assert status == 0
+    assert "[noise]\n# Of a range, m.\nrange_sigma = 0.0169\n" in text  # 5 cm / 3, and rounding to 1 cm
+    (tmp_path / "settings.toml").write_text(text)
+    options = read_config(tmp_path / "settings.toml")
+    assert Thresholds(**options["thresholds"]) == PAPER_THRESHOLDS
+    assert Rules(**options["rules"]) == PAPER_RULES
+    assert run("config", "--config", tmp_path / "settings.toml") == (0, text, "")
+    (tmp_path / "settings.toml").write_text(text.replace("gap_beams", "gap_beam"))
+    assert "did you mean 'gap_beams'?" in refuse("config", "--config", tmp_path / "settings.toml")
+
+
 def test_the_paper_preset_in_float64_with_two_rules_switched(run, log, tmp_path):
     config = tmp_path / "settings.toml"
     config.write_text("[rules]\nfit_circles = true\nweigh_circles = true\n")
@@ -357,10 +373,17 @@ EMPTY_SCANS = {
 def test_scans_that_hold_nothing(run, write, tmp_path, kind):
     path = write(*[flaser(EMPTY_SCANS[kind], (0, 0, 0), 100 + i) for i in range(3)])
     status, out, err = run("build", path, "-o", tmp_path / "out")
-    assert (status, err) == (0, "")
+    assert status == 0
     document = json.loads((tmp_path / "out/map.json").read_text())
     assert document["lines"] == []
     assert len(document["circles"]) <= 1
+    if not document["circles"]:
+        said = re.fullmatch(r"linemap: warning: \S+: nothing was found in 543 beams: (\d+) gave no return.*\n", err)
+        assert said is not None, err
+        assert int(said[1]) == 3 * np.sum(~((EMPTY_SCANS[kind] > 0) & (EMPTY_SCANS[kind] < 50)))
+        assert run("extract", path, "-o", tmp_path / "again.jsonl")[2].startswith(err)
+    else:
+        assert err == ""
     assert run("extract", path, "-o", tmp_path / "found.jsonl", "--quiet") == (0, "", "")
     assert len((tmp_path / "found.jsonl").read_text().splitlines()) == 3
 
@@ -413,7 +436,9 @@ def test_logs_that_cannot_be_used(refuse, tmp_path, content, cause):
 
 
 def test_a_folder_is_not_a_log(refuse, tmp_path):
-    assert refuse("build", tmp_path, "-o", tmp_path / "out") == f"{tmp_path}: is a directory, not a log"
+    assert refuse("build", tmp_path, "-o", tmp_path / "out") == (
+        f"{tmp_path}: is a directory, not a log, nor a ROS 2 bag with its metadata.yaml"
+    )
 
 
 def test_the_output_folder_is_a_file(refuse, log, tmp_path):
@@ -601,3 +626,104 @@ def test_importing_the_package_loads_neither_plotting_nor_readers():
     code = f"import sys, linemap_jax; print([name for name in {heavy} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"
+
+
+# --- ROS bags --------------------------------------------------------------------------------------------------------
+
+
+def bag_of(drive: list[str], *, cov: Any = None) -> Recording:
+    """The drive of a CARMEN log as a bag."""
+    recording = Recording()
+    recording.tf(99.0, "base_link", "laser", (0, 0, 0.3), static=True)
+    for line in drive:
+        fields = [float(field) for field in line.split()[1:-2]]
+        ranges, (x, y, theta), stamp = fields[1 : 1 + BEAMS], fields[1 + BEAMS : 4 + BEAMS], fields[-1]
+        recording.odometry(stamp, (x, y, theta), cov=cov)
+        recording.scan(stamp, ranges, angle_min=-np.pi / 2, angle_increment=np.deg2rad(1.0), range_max=50.0)
+    return recording
+
+
+def test_a_bag_gives_the_map_of_the_carmen_log(run, log, tmp_path):
+    # The covariance that the bag states is that which --pose-sigma takes where a log states none.
+    bag = bag_of(drive(), cov=np.diag([0.05**2, 0.05**2, 0, 0, 0, 0.01**2])).write(tmp_path, "mcap")
+    maps, said = [], []
+    for name, path in (("carmen", log), ("ros", bag)):
+        status, out, err = run("build", path, "-o", tmp_path / name)
+        assert (status, err) == (0, "")
+        said.append(out)
+        maps.append(json.loads((tmp_path / name / "map.json").read_text())["lines"])
+    assert "poses:   of the laser, as the log states them; noise: --pose-sigma 0.05 0.05 0.01\n" in said[0]
+    assert "poses:   nav_msgs/Odometry on /odom; noise: as the log states it; laser on the robot: tf, laser" in said[1]
+    assert len(maps[0]) == len(maps[1]) >= 3
+    for a, b in zip(*maps, strict=True):  # bearings of a bag have seven digits
+        np.testing.assert_allclose([a["rho"], a["theta"]], [b["rho"], b["theta"]], atol=1e-4)
+        np.testing.assert_allclose([a["begin"], a["end"]], [b["begin"], b["end"]], atol=1e-3)
+        np.testing.assert_allclose(a["cov"], b["cov"], atol=1e-6)
+
+
+def test_a_bag_without_poses_can_be_extracted_but_not_mapped(run, refuse, tmp_path):
+    recording = bag_of(drive())
+    recording.messages = [message for message in recording.messages if message[0] != "/odom"]
+    bag = recording.write(tmp_path)
+    assert "holds no poses" in refuse("build", bag, "-o", tmp_path / "out")
+    assert "exclude one another" in refuse("build", bag, "-o", tmp_path / "out", "--standstill", "--poses", bag)
+    status, _, err = run("extract", bag, "-o", tmp_path / "found.jsonl", "--quiet")
+    assert (status, err) == (0, "")
+    found = [json.loads(line) for line in (tmp_path / "found.jsonl").read_text().splitlines()]
+    assert [one["pose"] for one in found] == [None] * SCANS
+    assert all(len(one["lines"]) >= 3 for one in found)
+
+
+def test_info_of_a_carmen_log(run, log):
+    status, out, err = run("info", log, "--json")
+    assert (status, err) == (0, "")
+    told = json.loads(out)
+    assert (told["format"], told["scans"], told["beams"], told["rate_hz"]) == ("CARMEN log", SCANS, BEAMS, 1.0)
+    assert told["messages"] == [{"name": "FLASER", "type": None, "count": SCANS}]
+    np.testing.assert_allclose(told["bearings_rad"], [-np.pi / 2, np.pi / 180, np.pi / 2])
+    assert told["shares"]["returns"] > 0.99
+    assert sum(told["shares"].values()) == pytest.approx(1)
+    words = f"{log}: CARMEN log\n        10 FLASER\nscans:    10 in 9.0 s, 1.0 a second\n"
+    assert run("info", log)[1].startswith(words)
+
+
+def test_info_of_a_bag(run, tmp_path):
+    recording = Recording()
+    for i in range(4):
+        recording.scan(10.0 + 0.5 * i, [1.0, 2.0, np.nan, np.inf, -np.inf, 0.0, 30.0, 3.0])
+    status, out, _ = run("info", recording.write(tmp_path, "db3"))
+    assert status == 0
+    for words in (
+        "ROS 2 bag, SQLite\n         4 /scan (sensor_msgs/msg/LaserScan)\n",
+        "scans:    4 in 1.5 s, 2.0 a second",
+        "37.50% returns",
+        "12.50% invalid (NaN)",
+        "12.50% no return (beyond the maximum range)",
+        "would refuse it: it holds no poses",
+    ):
+        assert words in out
+
+
+def test_info_of_a_bag_with_two_scanners_tells_of_both(run, tmp_path):
+    recording = bag_of(drive(3))
+    recording.scan(100.5, [1.0] * 5, topic="/rear")
+    bag = recording.write(tmp_path)
+    status, out, _ = run("info", bag)
+    assert status == 0
+    assert "would refuse it: it holds the scans of several scanners, choose one by --scan-topic: /rear (1)," in out
+    assert "with --scan-topic /rear:\n  frames:   laser in base_link (static)\n  scans:    1 in 0.0 s\n" in out
+    told = json.loads(run("info", bag, "--json")[1])
+    assert {topic: of["scans"] for topic, of in told["scanners"].items()} == {"/rear": 1, "/scan": 3}
+    assert json.loads(run("info", bag, "--json", "--scan-topic", "/rear")[1])["beams"] == 5
+
+
+def test_info_of_a_bag_without_scans_tells_the_rest(run, refuse, tmp_path):
+    recording = Recording()
+    recording.odometry(1.0, (0, 0, 0))
+    bag = recording.write(tmp_path)
+    status, out, _ = run("info", bag)
+    assert status == 0
+    assert "1 /odom (nav_msgs/msg/Odometry)" in out
+    assert "it holds no sensor_msgs/LaserScan" in out
+    bag.write_bytes(bag.read_bytes()[:300])
+    assert "is cut off or damaged" in refuse("info", bag)

@@ -361,6 +361,9 @@ def test_trials_that_make_no_sense_are_refused(refuse, tmp_path: Path) -> None:
     out = "-o", tmp_path / "out"
     assert refuse("trials", *out, "--runs", 0) == "--runs must be from 1 to 100000000, not 0"
     assert refuse("trials", *out, "--scans", 0) == f"--scans must be from 1 to {MOST_SCANS}, not 0"
+    assert refuse("trials", *out, "--host", 1) == "--host must be from 0 to --hosts less one, not 1 of 1"
+    assert "several --hosts need a --coordinator" in refuse("trials", *out, "--hosts", 2)
+    assert "must be ADDRESS:PORT, not here" in refuse("trials", *out, "--hosts", 2, "--coordinator", "here")
     assert "1000 devices was asked for" in refuse("trials", *out, "--devices", 1000)
     assert refuse("trials", *out, "--config", tmp_path / "none.toml").startswith(f"cannot read {tmp_path}/none.toml")
     assert "there is no threshold 'nis': choose from gap_distance, " in refuse("trials", *out, "--sweep", "nis")

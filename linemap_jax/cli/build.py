@@ -13,9 +13,10 @@ import tyro
 
 from linemap_jax.cli.compilations import cache_folder
 from linemap_jax.cli.history import History
-from linemap_jax.cli.logs import SCANS_EXPLAINED, chunks_of_log, progress, warn
+from linemap_jax.cli.logs import SCANS_EXPLAINED, chunks_of_log, mount_of, opened, progress, tell_poses, warn
 from linemap_jax.cli.options import LogOptions, options_of_update
 from linemap_jax.cli.output import check_output, make_folder, say
+from linemap_jax.cli.rejections import Rejections
 from linemap_jax.cli.resume import START_CAPACITY, differences, map_to_resume
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ class Build(LogOptions):
     """Build a map from a log: writes map.json and map.png, and prints a summary."""
 
     log: tyro.conf.Positional[Path]
-    """CARMEN log, plain or .gz."""
+    """CARMEN log, plain or .gz; ROS 1 .bag; ROS 2 bag: its folder, .mcap or .db3."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="DIR")]
     """Folder for the map; made if it is not there."""
     pose_error: Literal["independent", "persistent", "unknown"] = "unknown"
@@ -50,22 +51,15 @@ class Build(LogOptions):
     def run(self) -> int:
         """Build the map, and give the exit status."""
         options: dict[str, Any] = options_of_update(self) | {"pose_error": self.pose_error}
-        from linemap_jax.core.settings import Mount
         from linemap_jax.core.state import Status
-        from linemap_jax.io.log import open_log
         from linemap_jax.io.map_file import write_map
         from linemap_jax.io.plot import plot_map
 
         map_file, picture, page = (self.output / f"map.{ending}" for ending in ("json", "png", "html"))
         check_output(self.output, map_file, picture, *([page] if self.html else []), overwrite=self.overwrite)
         before = map_to_resume(self.resume_from, self.dtype) if self.resume_from else None
-        log = open_log(self.log, strict=self.strict, range_max=self.range_max)
-        if self.laser_offset is not None and next(iter(log)).pose_frame == "laser":
-            options["mount"] = Mount()
-            say(
-                f"warning: {log.path}: its poses are the laser's, so that --laser-offset has no effect",
-                quiet=self.quiet,
-            )
+        log = opened(self, self.log)
+        options["mount"] = mount_of(self, log, quiet=self.quiet)
         settings = {
             "log": self.log.name,
             "preset": self.preset,
@@ -89,6 +83,8 @@ class Build(LogOptions):
                 quiet=self.quiet,
             )
 
+        if not line_map.lines.valid.any() and not line_map.circles.valid.any():
+            say(f"warning: {log.path}: {_rejections(self, log, options)}", quiet=self.quiet)
         make_folder(self.output)
         write_map(map_file, line_map, settings, overwrite=self.overwrite)
         plot_map(picture, line_map, positions, title=self.log.name, overwrite=self.overwrite)
@@ -101,7 +97,7 @@ class Build(LogOptions):
             print(f"linemap: interrupted; the map so far is in {self.output}", file=sys.stderr)
             return 130
         files = {"map": str(map_file), "picture": str(picture)} | ({"page": str(page)} if self.html else {})
-        summary = _summary(self, line_map, report, options, seconds) | files
+        summary = _summary(self, line_map, report, options, seconds) | {"poses": tell_poses(self, log)} | files
         print(json.dumps(summary, indent=2) if self.json else _in_words(summary))
         return 0
 
@@ -170,6 +166,20 @@ def _map_of_log(
     return line_map, join_reports(reports), positions, seconds, interrupted
 
 
+def _rejections(command: Build, log: "Log", options: dict[str, Any]) -> Rejections:
+    """Why the scans of a log gave nothing: they are extracted once more, which the map has no use for otherwise."""
+    from linemap_jax.build import CHUNK, extract_chunk
+    from linemap_jax.core.settings import SCAN_CAPACITY
+
+    rejections, capacity = Rejections(), SCAN_CAPACITY
+    of_map = ("mount", "persistence", "pose_error")
+    options = {name: option for name, option in options.items() if name not in of_map}
+    for chunk in chunks_of_log(command, log, CHUNK):
+        found, capacity = extract_chunk(chunk.scans, capacity=capacity, **options)
+        rejections.add(found)
+    return rejections
+
+
 def _summary(
     command: Build, line_map: "LineMap", report: "Report", options: dict[str, Any], seconds: list[float]
 ) -> dict[str, Any]:
@@ -177,13 +187,12 @@ def _summary(
     import numpy as np
 
     from linemap_jax.build import CHUNK
-    from linemap_jax.io.log import open_log
     from linemap_jax.lab.evaluation import duplicates, explained_share
 
     # Evenly spread scans are enough for a share, and on a long log save a third of the time.
     scans = int(report.status.shape[0])
     seldom = dataclasses.replace(command, every=command.every * -(-scans // SCANS_EXPLAINED))
-    log = open_log(command.log, strict=command.strict, range_max=command.range_max)
+    log = opened(command, command.log)
     chunks = ((chunk.scans, chunk.poses) for chunk in chunks_of_log(seldom, log, CHUNK))
     share = explained_share(line_map, chunks, options["mount"], chunk=CHUNK)
     lines = line_map.lines
@@ -213,6 +222,7 @@ def _in_words(summary: dict[str, Any]) -> str:
         f"{summary['explained']:.1%} of the returns under 20 m lie within 10 cm of them; "
         f"median line {summary['median_line_length_m']:.2f} m, {summary['duplicates']} duplicate lines\n"
         f"{summary['seconds_to_first_chunk']:.1f} s to compile, {then}\n"
+        f"poses:   {summary['poses']}\n"
         f"map:     {summary['map']}\n"
         f"picture: {summary['picture']}" + (f"\npage:    {summary['page']}" if "page" in summary else "")
     )

@@ -8,29 +8,23 @@ from typing import Annotated
 import tyro
 
 from linemap_jax.cli.compilations import keep_compilations
-from linemap_jax.cli.logs import warn
-from linemap_jax.cli.options import MOST_SCANS, UsageError, check_offset, check_range_max
+from linemap_jax.cli.logs import mount_of, opened, warn
+from linemap_jax.cli.options import MOST_SCANS, LogInput, UsageError, check_input
 from linemap_jax.cli.output import check_output, make_folder
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Calibrate:
+class Calibrate(LogInput):
     """Tell the noise of the scanner and of the poses from a log."""
 
     log: tyro.conf.Positional[Path]
-    """CARMEN log, plain or .gz."""
+    """CARMEN log, plain or .gz; ROS 1 .bag; ROS 2 bag: its folder, .mcap or .db3."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE.toml")] = None
     """Settings file for --config of the other commands, with the noise of the scanner."""
     scans: Annotated[int, tyro.conf.arg(metavar="N")] = 1000
     """Number of scans that are used at most, from the first on."""
     lag: Annotated[int, tyro.conf.arg(metavar="N")] = 1
     """Poses are compared with those N scans later: errors that last longer are not seen."""
-    range_max: Annotated[float | None, tyro.conf.arg(metavar="M")] = None
-    """Ranges from here on are no-returns, m. What the log states, or 50, unless given."""
-    laser_offset: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y THETA")] = None
-    """Pose of the laser on the robot, m m rad. Used only with poses that are the robot's."""
-    strict: bool = False
-    """Refuse a log with malformed lines, instead of skipping and counting them."""
     overwrite: bool = False
     """Replace output that is there already."""
     quiet: bool = False
@@ -44,8 +38,7 @@ class Calibrate:
             raise UsageError(f"--scans must be from 2 to {MOST_SCANS}, not {self.scans}")
         if not 1 <= self.lag < self.scans:
             raise UsageError(f"--lag must be from 1 to less than the number of scans, not {self.lag}")
-        check_range_max(self.range_max)
-        check_offset(self.laser_offset)
+        check_input(self)
         if self.output:
             check_output(self.output.parent, self.output, overwrite=self.overwrite)
         import jax
@@ -54,16 +47,15 @@ class Calibrate:
         keep_compilations()
         import numpy as np
 
-        from linemap_jax.core.settings import Mount, SensorNoise
+        from linemap_jax.core.settings import SensorNoise
         from linemap_jax.io.atomic import atomic_write
-        from linemap_jax.io.log import open_log
         from linemap_jax.io.scans import chunks_of_readings
         from linemap_jax.lab.calibration import pose_noise, sensor_noise
 
-        log = open_log(self.log, strict=self.strict, range_max=self.range_max)
+        log = opened(self, self.log)
+        mount = mount_of(self, log, quiet=self.quiet)
         chunk = next(chunks_of_readings(log, self.scans, cov_pose=np.zeros((3, 3)), dtype="float64"))
         warn(log, quiet=self.quiet)
-        mount = Mount(*self.laser_offset) if self.laser_offset else Mount()
         try:
             sensor = sensor_noise(chunk.scans)
             noise = SensorNoise(range_sigma=float(sensor.sigma[0]), bearing_sigma=float(sensor.sigma[1]))

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from linemap_jax.cli.logs import plain_chunks, progress, warn
+from linemap_jax.cli.logs import mount_of, opened, plain_chunks, progress, warn
 from linemap_jax.cli.merge import read_two_maps
-from linemap_jax.cli.options import UsageError, check_range_max
+from linemap_jax.cli.options import LogInput, UsageError, check_input
 
 if TYPE_CHECKING:
     from linemap_jax.lab.comparison import Change, Comparison, What
@@ -20,7 +20,7 @@ MOST_TOLD = 15
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Compare:
+class Compare(LogInput):
     """Compare two maps that are in one frame: what has moved, vanished or appeared, and how sure that is."""
 
     a: tyro.conf.Positional[Path]
@@ -39,10 +39,6 @@ class Compare:
     """Shortest piece of a line that is told to have vanished or appeared, m."""
     at_least: Annotated[int, tyro.conf.arg(metavar="N")] = 3
     """Lines and circles that were detected more seldom are passed over."""
-    range_max: Annotated[float | None, tyro.conf.arg(metavar="M")] = None
-    """Ranges from here on are no-returns, m. What the logs state, or 50, unless given."""
-    strict: bool = False
-    """Refuse a log with malformed lines, instead of skipping and counting them."""
     quiet: bool = False
     """No progress, no warnings."""
     json: bool = False
@@ -57,10 +53,9 @@ class Compare:
             raise UsageError(f"--alpha must be between 0 and 1, not {self.alpha}")
         if self.at_least < 1:
             raise UsageError(f"--at-least must be 1 or more, not {self.at_least}")
-        check_range_max(self.range_max)
+        check_input(self)
         a, b, _ = read_two_maps(self.a, self.b)
         from linemap_jax.build import CHUNK
-        from linemap_jax.io.log import open_log
         from linemap_jax.lab.comparison import compare_maps, looked_through
 
         options = {"within": self.within, "alpha": self.alpha, "shortest": self.shortest, "at_least": self.at_least}
@@ -68,9 +63,10 @@ class Compare:
         logs: list[tuple[What, Path | None]] = [("appeared", self.log_a), ("vanished", self.log_b)]
         for what, path in logs:
             if path is not None:
-                log = open_log(path, strict=self.strict, range_max=self.range_max)
+                log = opened(self, path)
+                mount = mount_of(self, log, quiet=self.quiet)
                 with progress(log, quiet=self.quiet):
-                    changes = looked_through(found.changes, plain_chunks(log), what, chunk=CHUNK)
+                    changes = looked_through(found.changes, plain_chunks(log), what, mount, chunk=CHUNK)
                 found = found._replace(changes=changes)
                 warn(log, quiet=self.quiet)
         print(json.dumps(_summary(self, found), indent=2) if self.json else _in_words(found))

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from linemap_jax.cli.compilations import keep_compilations
-from linemap_jax.cli.logs import SCANS_EXPLAINED, plain_chunks, progress, warn
-from linemap_jax.cli.options import UsageError, check_range_max
+from linemap_jax.cli.logs import SCANS_EXPLAINED, mount_of, opened, plain_chunks, progress, warn
+from linemap_jax.cli.options import LogInput, UsageError, check_input
 from linemap_jax.cli.worlds import world_from_file
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Evaluate:
+class Evaluate(LogInput):
     """Score a map: against a true world, or against a log, or both."""
 
     map: tyro.conf.Positional[Path]
@@ -26,15 +26,11 @@ class Evaluate:
     world: Annotated[Path | None, tyro.conf.arg(metavar="FILE.geojson")] = None
     """The truth. With a log, only what its beams met can be missed; without, all of it."""
     log: Annotated[Path | None, tyro.conf.arg(metavar="LOG")] = None
-    """CARMEN log, plain or .gz: how much of it the map explains."""
+    """CARMEN log or ROS bag, as for `build`: how much of it the map explains."""
     at: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """The truth is what is there at scan N. The last one of the log, or else after all changes, unless given."""
     distance: Annotated[float, tyro.conf.arg(metavar="M")] = 0.05
     """How far a line may lie from a wall, and the centre of a circle outside of a pole, m."""
-    range_max: Annotated[float | None, tyro.conf.arg(metavar="M")] = None
-    """Ranges from here on are no-returns, m. What the log states, or 50, unless given."""
-    strict: bool = False
-    """Refuse a log with malformed lines, instead of skipping and counting them."""
     quiet: bool = False
     """No progress, no warnings."""
     json: bool = False
@@ -48,7 +44,7 @@ class Evaluate:
             raise UsageError(f"--distance must be positive, not {self.distance}")
         if self.at is not None and not 0 <= self.at < 2**31 - 1:
             raise UsageError(f"--at must be from 0 to 2^31 - 2, not {self.at}")
-        check_range_max(self.range_max)
+        check_input(self)
         import jax
 
         jax.config.update("jax_enable_x64", True)
@@ -70,7 +66,6 @@ def _against_world(command: Evaluate, path: Path, line_map: "LineMap") -> dict[s
     import numpy as np
 
     from linemap_jax.build import CHUNK
-    from linemap_jax.io.log import open_log
     from linemap_jax.lab.check import WorldError, check
     from linemap_jax.lab.evaluation import seen_in_log
     from linemap_jax.lab.scoring import GONE, Gates, evaluate, times_of_objects
@@ -83,9 +78,10 @@ def _against_world(command: Evaluate, path: Path, line_map: "LineMap") -> dict[s
         raise UsageError(f"{path}: {error}") from error
     seen, at = None, NEVER - 1
     if command.log is not None:
-        log = open_log(command.log, strict=command.strict, range_max=command.range_max)
+        log = opened(command, command.log)
+        mount = mount_of(command, log, quiet=command.quiet)
         with progress(log, quiet=command.quiet):
-            seen, scans = seen_in_log(world, plain_chunks(log), chunk=CHUNK)
+            seen, scans = seen_in_log(world, plain_chunks(log), mount, chunk=CHUNK)
         at = scans - 1
     at = at if command.at is None else command.at
     score = evaluate(line_map, world, seen, scan_index=at, gates=Gates(distance=command.distance))
@@ -121,14 +117,14 @@ def _against_world(command: Evaluate, path: Path, line_map: "LineMap") -> dict[s
 def _against_log(command: Evaluate, path: Path, line_map: "LineMap") -> dict[str, Any]:
     """What a log says of a map, in numbers; None where there is nothing to tell of."""
     from linemap_jax.build import CHUNK
-    from linemap_jax.io.log import open_log
     from linemap_jax.lab.evaluation import evaluate_log
 
-    log = open_log(path, strict=command.strict, range_max=command.range_max)
+    log = opened(command, path)
+    mount = mount_of(command, log, quiet=command.quiet)
     scans = sum(1 for _ in log)
     warn(log, quiet=command.quiet)
     with progress(log, quiet=command.quiet):
-        score = evaluate_log(line_map, plain_chunks(log, every=-(-scans // SCANS_EXPLAINED)), chunk=CHUNK)
+        score = evaluate_log(line_map, plain_chunks(log, every=-(-scans // SCANS_EXPLAINED)), mount, chunk=CHUNK)
     return {
         "log": str(path),
         "scans": scans,

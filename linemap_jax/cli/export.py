@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from linemap_jax.cli.compilations import keep_compilations
-from linemap_jax.cli.logs import progress, warn
-from linemap_jax.cli.options import UsageError, check_offset, check_range_max
+from linemap_jax.cli.logs import mount_of, opened, progress, warn
+from linemap_jax.cli.options import LogInput, UsageError, check_input
 from linemap_jax.cli.output import say
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ FormatName = Literal["json", "geojson", "svg", "dxf", "nav2", "mcap", "tum", "pn
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Export:
+class Export(LogInput):
     """Write a map in another format: for GIS, CAD, ROS 2, nav2, a browser."""
 
     map: tyro.conf.Positional[Path]
@@ -29,16 +29,10 @@ class Export:
     to: Annotated[FormatName | None, tyro.conf.arg(metavar="FORMAT")] = None
     """json, geojson, svg, dxf, nav2 (.yaml), mcap, tum, png or html. That of the file's ending unless given."""
     log: Annotated[Path | None, tyro.conf.arg(metavar="LOG")] = None
-    """CARMEN log, plain or .gz, in the frame of the map: `nav2` makes its grid of the scans, `tum` writes the poses,
+    """CARMEN log or ROS bag, in the frame of the map: `nav2` makes its grid of the scans, `tum` writes the poses,
     pictures show the path."""
     resolution: Annotated[float, tyro.conf.arg(metavar="M")] = 0.05
     """Side of a cell of `nav2`, m."""
-    range_max: Annotated[float | None, tyro.conf.arg(metavar="M")] = None
-    """Ranges from here on are no-returns, m. What the log states, or 50, unless given."""
-    laser_offset: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y THETA")] = None
-    """Pose of the laser on the robot, m m rad. Used only with poses that are the robot's."""
-    strict: bool = False
-    """Refuse a log with malformed lines, instead of skipping and counting them."""
     overwrite: bool = False
     """Replace output that is there already."""
     quiet: bool = False
@@ -56,19 +50,17 @@ class Export:
             raise UsageError(f"{name} is made from the scans of a log; give --log")
         if not 0 < self.resolution < float("inf"):
             raise UsageError(f"--resolution must be positive, not {self.resolution}")
-        check_range_max(self.range_max)
-        check_offset(self.laser_offset)
+        check_input(self)
         import jax
 
         jax.config.update("jax_enable_x64", True)
         keep_compilations()
-        from linemap_jax.io.log import open_log
         from linemap_jax.io.map_file import read_map
 
         line_map, settings = read_map(self.map)
         added: dict[str, Any] = {}
         if self.log is not None and name not in ("json", "geojson"):
-            log = open_log(self.log, strict=self.strict, range_max=self.range_max)
+            log = opened(self, self.log)
             with progress(log, quiet=self.quiet):
                 added = _read(self, log, name)
             warn(log, quiet=self.quiet)
@@ -85,14 +77,12 @@ def _read(command: Export, log: "Log", name: str) -> dict[str, Any]:
 
     from linemap_jax.build import CHUNK
     from linemap_jax.cli.logs import plain_chunks
-    from linemap_jax.core.settings import Mount
     from linemap_jax.io.html import MOST_POINTS
     from linemap_jax.io.scans import chunks_of_readings
     from linemap_jax.io.thinned import Thinned
     from linemap_jax.lab.occupancy import occupancy, returns_in_world
 
-    offset = command.laser_offset
-    mount = Mount(*offset) if offset is not None and next(iter(log)).pose_frame == "robot" else Mount()
+    mount = mount_of(command, log, quiet=command.quiet)
     if name == "nav2":
         try:
             return {"grid": occupancy(lambda: plain_chunks(log), mount, resolution=command.resolution)}

@@ -6,9 +6,10 @@ from typing import Annotated
 
 import tyro
 
-from linemap_jax.cli.logs import chunks_of_log, progress, warn
+from linemap_jax.cli.logs import chunks_of_log, opened, progress, warn
 from linemap_jax.cli.options import LogOptions, options_of_update
 from linemap_jax.cli.output import say
+from linemap_jax.cli.rejections import Rejections
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -16,7 +17,7 @@ class Extract(LogOptions):
     """Extract lines and circles scan by scan: one JSON line a scan, in the frame of the sensor."""
 
     log: tyro.conf.Positional[Path]
-    """CARMEN log, plain or .gz."""
+    """CARMEN log, plain or .gz; ROS 1 .bag; ROS 2 bag: its folder, .mcap or .db3."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE.jsonl")]
     """File to write."""
 
@@ -27,18 +28,20 @@ class Extract(LogOptions):
         from linemap_jax.core.settings import SCAN_CAPACITY
         from linemap_jax.io.atomic import atomic_write
         from linemap_jax.io.jsonl import lines_of_extraction
-        from linemap_jax.io.log import open_log
 
-        del options["mount"], options["persistence"]  # the result stands in the frame of the sensor
-        log = open_log(self.log, strict=self.strict, range_max=self.range_max)
-        capacity, written = SCAN_CAPACITY, 0
+        del options["persistence"]  # the result stands in the frame of the sensor
+        log = opened(self, self.log, need_poses=False)
+        capacity, written, rejections = SCAN_CAPACITY, 0, Rejections()
         with atomic_write(self.output, overwrite=self.overwrite) as path, path.open("w", encoding="utf-8") as file:
             with progress(log, quiet=self.quiet):
                 for chunk in chunks_of_log(self, log, CHUNK):
                     found, capacity = extract_chunk(chunk.scans, capacity=capacity, **options)
+                    rejections.add(found)
                     for line in lines_of_extraction(chunk.timestamps, chunk.poses, found):
                         file.write(line + "\n")
                         written += 1
         warn(log, quiet=self.quiet)
+        if not rejections.found:
+            say(f"warning: {self.log}: {rejections}", quiet=self.quiet)
         say(f"{written} scans -> {self.output}", quiet=self.quiet)
         return 0

@@ -3,18 +3,51 @@
 import contextlib
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from linemap_jax.cli.options import LogOptions
+from linemap_jax.cli.options import LogInput, LogOptions
 from linemap_jax.cli.output import say
 
 if TYPE_CHECKING:
+    from linemap_jax.core.settings import Mount
     from linemap_jax.core.state import Pose, Scan
     from linemap_jax.io.log import Log
     from linemap_jax.io.scans import Chunk
 
-SCANS_EXPLAINED = 500
+SCANS_EXPLAINED = 250
 """What a log says of a map is taken over so many of its scans at most."""
+
+
+def opened(command: LogInput, path: Path, *, need_poses: bool = True) -> "Log":
+    """A log, to be read as the options want it."""
+    from linemap_jax.io.frames import Standstill
+    from linemap_jax.io.log import open_log
+    from linemap_jax.io.tum import read_tum
+
+    poses = Standstill() if command.standstill else None if command.poses is None else read_tum(command.poses)
+    return open_log(
+        path,
+        strict=command.strict,
+        range_min=command.range_min,
+        range_max=command.range_max,
+        bearing_override=command.bearings,
+        scan_topic=command.scan_topic,
+        odom_topic=command.odom_topic,
+        mount=command.laser_offset,
+        poses=poses,
+        need_poses=need_poses,
+    )
+
+
+def mount_of(command: LogInput, log: "Log", *, quiet: bool) -> "Mount":
+    """How the laser sits on the robot. The log is read up to its first scan."""
+    from linemap_jax.core.settings import Mount
+
+    reading = next(iter(log))
+    if command.laser_offset is not None and reading.pose_frame == "laser":
+        say(f"warning: {log.path}: its poses are the laser's, so that --laser-offset has no effect", quiet=quiet)
+    return Mount(*(reading.mount or (0.0, 0.0, 0.0)))
 
 
 def chunks_of_log(command: LogOptions, log: "Log", size: int) -> Iterator["Chunk"]:
@@ -24,9 +57,7 @@ def chunks_of_log(command: LogOptions, log: "Log", size: int) -> Iterator["Chunk
     from linemap_jax.io.scans import chunks_of_readings
 
     cov_pose = np.diag(np.square(command.pose_sigma))
-    return chunks_of_readings(
-        log, size, cov_pose=cov_pose, range_min=command.range_min, every=command.every, dtype=command.dtype
-    )
+    return chunks_of_readings(log, size, cov_pose=cov_pose, every=command.every, dtype=command.dtype)
 
 
 def plain_chunks(log: "Log", every: int = 1) -> Iterator[tuple["Scan", "Pose"]]:
@@ -57,6 +88,21 @@ def progress(log: "Log", *, quiet: bool) -> Iterator[None]:
         log.progress = show
         yield
         log.progress = None
+
+
+def tell_poses(command: LogOptions, log: "Log") -> str:
+    """Where the poses of a log that has been read came from, and what is taken for their noise."""
+    notes = log.notes
+    stated, scans = notes.stated_covs, notes.scans
+    sigma = "--pose-sigma " + " ".join(f"{x:g}" for x in command.pose_sigma)
+    if stated == scans:
+        noise = "as the log states it"
+    elif stated == 0:
+        noise = sigma
+    else:
+        noise = f"as the log states it for {stated} of {scans} scans, {sigma} for the others"
+    mounting = f"; laser on the robot: {notes.mounting}" if notes.mounting else ""
+    return f"{notes.poses}; noise: {noise}{mounting}"
 
 
 def warn(log: "Log", *, quiet: bool) -> None:

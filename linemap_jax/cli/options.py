@@ -3,14 +3,21 @@
 import dataclasses
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from linemap_jax.cli.compilations import keep_compilations
 
+if TYPE_CHECKING:
+    from linemap_jax.core.settings import SensorNoise
+
 MOST_SCANS = 20_000
 """Of a simulated drive, which is held in memory as a whole."""
+
+
+ScannerName = Literal["pls", "lms200", "utm30lx", "rplidar_a1"]
+"""Instruments of `lab.scanners`."""
 
 
 class UsageError(Exception):
@@ -18,26 +25,47 @@ class UsageError(Exception):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class LogOptions:
-    """Options of all commands that read a log."""
+class LogInput:
+    """Options of all commands that read a log: what to take from it."""
+
+    range_min: Annotated[float | None, tyro.conf.arg(metavar="M")] = None
+    """Smallest range that counts as a return, m. What the log states, or 0, unless given."""
+    range_max: Annotated[float | None, tyro.conf.arg(metavar="M")] = None
+    """Ranges from here on are no-returns, m. What the log states, or 50, unless given."""
+    bearings: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="FIRST STEP")] = None
+    """Bearing of the first beam and step to the next, rad. What the log states unless given."""
+    laser_offset: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y THETA")] = None
+    """Pose of the laser on the robot, m m rad. Used only with poses that are the robot's; what the log states, or 0,
+    unless given."""
+    scan_topic: Annotated[str | None, tyro.conf.arg(metavar="TOPIC")] = None
+    """Topic of the scans, for a bag with several scanners."""
+    odom_topic: Annotated[str | None, tyro.conf.arg(metavar="TOPIC")] = None
+    """Topic of the odometry to take poses from, for a bag with several, or in place of tf."""
+    poses: Annotated[Path | None, tyro.conf.arg(metavar="FILE.tum")] = None
+    """Poses of the robot (timestamp tx ty tz qx qy qz qw), in place of those of the log."""
+    standstill: bool = False
+    """The robot did not move: for a log without poses."""
+    strict: bool = False
+    """Refuse a log with malformed lines or messages, instead of skipping and counting them."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LogOptions(LogInput):
+    """Options of the commands that run the method on a log."""
 
     preset: Literal["default", "paper"] = "default"
     """The method: `paper` is the literal reading of 1996, `default` the same with its known faults mended."""
     config: Path | None = None
-    """TOML file with tables [thresholds], [noise], [rules], [persistence]; goes over the preset. Options given here go
-    over both."""
+    """TOML file with tables [thresholds], [noise], [rules], [persistence], as `linemap config` writes it; goes over the
+    preset. Options given here go over both."""
+    scanner: ScannerName | None = None
+    """The instrument: stands for the noise that its data sheet states, unless the settings file states it."""
     range_sigma: Annotated[float | None, tyro.conf.arg(metavar="M")] = None
-    """Standard deviation of a range, m. 0.02 unless given."""
+    """Standard deviation of a range, m. That of the scanner, or 0.02, unless given."""
     bearing_sigma: Annotated[float | None, tyro.conf.arg(metavar="RAD")] = None
-    """Standard deviation of a bearing, rad. 0.001 unless given."""
+    """Standard deviation of a bearing, rad. That of the scanner, or 0.001, unless given."""
     pose_sigma: Annotated[tuple[float, float, float], tyro.conf.arg(metavar="X Y THETA")] = (0.05, 0.05, 0.01)
-    """Standard deviations of every pose, m m rad: logs do not state them."""
-    range_min: Annotated[float, tyro.conf.arg(metavar="M")] = 0.0
-    """Smallest range that counts as a return, m."""
-    range_max: Annotated[float | None, tyro.conf.arg(metavar="M")] = None
-    """Ranges from here on are no-returns, m. What the log states, or 50, unless given."""
-    laser_offset: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y THETA")] = None
-    """Pose of the laser on the robot, m m rad. Used only with poses that are the robot's."""
+    """Standard deviations of every pose for which the log states no covariance, m m rad."""
     covariance: Literal["exact", "printed"] | None = None
     """`exact` to first order, or eq. 12 as `printed`. That of the preset unless given."""
     jacobians: Literal["autodiff", "analytic"] = "analytic"
@@ -48,8 +76,6 @@ class LogOptions:
     """Take every N-th scan."""
     dtype: Literal["float32", "float64"] = "float32"
     """Precision of all numbers."""
-    strict: bool = False
-    """Refuse a log with malformed lines, instead of skipping and counting them."""
     overwrite: bool = False
     """Replace output that is there already."""
     quiet: bool = False
@@ -57,35 +83,48 @@ class LogOptions:
 
 
 def options_of_update(command: LogOptions) -> dict[str, Any]:
-    """The keyword arguments of `update`: preset, then the settings file, then the options of the command line."""
+    """The keyword arguments of `update`: preset, then the settings file, then the options of the command line.
+
+    The mount, which the log may state, is left to `linemap_jax.cli.logs`.
+    """
     _check(command)
     import jax
 
     jax.config.update("jax_enable_x64", command.dtype == "float64")
-    from linemap_jax.core.settings import Mount, SensorNoise
-
-    options = options_of_method(command.preset, command.config)
-    options |= {"mount": Mount(), "noise": options["noise"] or SensorNoise()}
+    options = options_of_method(command.preset, command.config, noise_of_scanner(command.scanner))
     sigmas = {"range_sigma": command.range_sigma, "bearing_sigma": command.bearing_sigma}
     given = {name: sigma for name, sigma in sigmas.items() if sigma is not None}
     options["noise"] = dataclasses.replace(options["noise"], **given)
-    if command.laser_offset is not None:
-        options["mount"] = Mount(*command.laser_offset)
     if command.covariance is not None:
         options["covariance"] = command.covariance
     return options | {"jacobians": command.jacobians, "segmentation": command.segmentation}
 
 
-def options_of_method(name: Literal["default", "paper"], config: Path | None) -> dict[str, Any]:
-    """The preset, and the settings file over it; no noise unless the file states it."""
+def options_of_method(
+    name: Literal["default", "paper"], config: Path | None, noise: "SensorNoise | None" = None
+) -> dict[str, Any]:
+    """The preset with some noise, and the settings file over it; no noise where neither states it."""
     keep_compilations()
     from linemap_jax.core.settings import Persistence, SensorNoise, preset
     from linemap_jax.io.config import read_config
 
-    options = preset(name) | {"noise": None, "persistence": Persistence()}
+    options = preset(name) | {"noise": noise, "persistence": Persistence()}
     for section, fields in (read_config(config) if config else {}).items():
         options[section] = dataclasses.replace(options[section] or SensorNoise(), **fields)
     return options
+
+
+def noise_of_scanner(name: ScannerName | None) -> "SensorNoise":
+    """The noise of an instrument; the default's where none is named."""
+    from linemap_jax.core.settings import SensorNoise
+
+    if name is None:
+        return SensorNoise()
+    from linemap_jax.lab.scanners import PRESETS, noise_of
+
+    noise = noise_of(PRESETS[name]())
+    # Data sheets do not state more digits.
+    return SensorNoise(range_sigma=float(f"{noise.range_sigma:.3g}"), bearing_sigma=float(f"{noise.bearing_sigma:.3g}"))
 
 
 def _check(command: LogOptions) -> None:
@@ -93,29 +132,29 @@ def _check(command: LogOptions) -> None:
     inf = float("inf")
     if not 1 <= command.every <= 10**9:
         raise UsageError(f"--every must be from 1 to 10^9, not {command.every}")
-    if not 0 <= command.range_min < inf:
-        raise UsageError(f"--range-min must be zero or positive, not {command.range_min}")
-    if command.range_max is not None and not command.range_min < command.range_max:
-        raise UsageError(f"--range-max must be more than --range-min, not {command.range_max}")
+    check_input(command)
     if command.range_sigma is not None and not 0 < command.range_sigma < inf:
         raise UsageError(f"--range-sigma must be positive, not {command.range_sigma}")
     if command.bearing_sigma is not None and not 0 <= command.bearing_sigma < inf:
         raise UsageError(f"--bearing-sigma must be zero or positive, not {command.bearing_sigma}")
     if not all(0 <= x < inf for x in command.pose_sigma):
         raise UsageError(f"--pose-sigma must be zero or positive, not {command.pose_sigma}")
-    check_offset(command.laser_offset)
 
 
-def check_range_max(range_max: float | None) -> None:
-    """Refuse a range that cannot be the first one of no return."""
-    if range_max is not None and not range_max > 0:
-        raise UsageError(f"--range-max must be positive, not {range_max}")
-
-
-def check_offset(offset: tuple[float, float, float] | None) -> None:
-    """Refuse a pose of the laser that is none."""
-    if offset is not None and not all(map(math.isfinite, offset)):
-        raise UsageError(f"--laser-offset must be finite, not {offset}")
+def check_input(command: LogInput) -> None:
+    """Refuse what no log can be read by."""
+    if command.range_min is not None and not 0 <= command.range_min < math.inf:
+        raise UsageError(f"--range-min must be zero or positive, not {command.range_min}")
+    if command.range_max is not None and not (command.range_min or 0) < command.range_max:
+        raise UsageError(f"--range-max must be positive and more than --range-min, not {command.range_max}")
+    if command.bearings is not None:
+        first, step = command.bearings
+        if not (abs(first) <= 2 * math.pi and 0 < abs(step) <= 2 * math.pi):
+            raise UsageError(f"--bearings must be a first bearing and a step in radians, not {command.bearings}")
+    if command.laser_offset is not None and not all(map(math.isfinite, command.laser_offset)):
+        raise UsageError(f"--laser-offset must be finite, not {command.laser_offset}")
+    if command.standstill and command.poses is not None:
+        raise UsageError("--standstill and --poses exclude one another")
 
 
 def check_drive(*, scans: int, pose_sigma: tuple[float, float, float], pose_correlation: float, seed: int) -> None:

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import tyro
 
 from linemap_jax.cli.compilations import keep_compilations
-from linemap_jax.cli.options import UsageError, check_drive
+from linemap_jax.cli.options import ScannerName, UsageError, check_drive
 from linemap_jax.cli.output import check_output, make_folder
 from linemap_jax.cli.worlds import WorldKind, made_world, world_from_file
 
@@ -27,7 +27,7 @@ class Simulate:
     """World to make."""
     scans: Annotated[int, tyro.conf.arg(metavar="N")] = 300
     """Number of scans along the path."""
-    scanner: Literal["pls", "lms200", "utm30lx", "rplidar_a1"] = "pls"
+    scanner: ScannerName = "pls"
     """The instrument."""
     pose_sigma: Annotated[tuple[float, float, float], tyro.conf.arg(metavar="X Y THETA")] = (0.01, 0.01, 0.002)
     """Standard deviations of every pose of the log, m m rad."""

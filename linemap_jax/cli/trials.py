@@ -5,14 +5,16 @@ import dataclasses
 import json
 import math
 import os
+import socket
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from linemap_jax.cli.options import UsageError, check_drive, options_of_method
+from linemap_jax.cli.options import ScannerName, UsageError, check_drive, options_of_method
 from linemap_jax.cli.worlds import WorldKind, made_world
 
 if TYPE_CHECKING:
@@ -27,6 +29,12 @@ BATCH_RUNS = 32
 CHUNK_RUNS = 256
 """Drives after which the results are written, of all devices together."""
 
+LONGEST_WAIT = 60.0
+"""Seconds that host 0 has to appear."""
+
+NO_MATTER = ("output", "devices", "hosts", "host", "coordinator", "quiet", "json")
+"""Options on which the results do not depend."""
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Trials:
@@ -40,7 +48,7 @@ class Trials:
     """Number of drives."""
     scans: Annotated[int, tyro.conf.arg(metavar="N")] = 50
     """Number of scans of each."""
-    scanner: Literal["pls", "lms200", "utm30lx", "rplidar_a1"] = "pls"
+    scanner: ScannerName = "pls"
     """The instrument; the map builder knows its noise."""
     preset: Literal["default", "paper"] = "default"
     """The method."""
@@ -57,7 +65,13 @@ class Trials:
     seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0
     """Decides everything that is left to chance."""
     devices: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """Processors, or accelerators, that share the work. All of them unless given."""
+    """Processors, or accelerators, that share the work. All of them, of all hosts, unless given."""
+    hosts: Annotated[int, tyro.conf.arg(metavar="N")] = 1
+    """Machines that share the work: give the same command on each of them, but for --host."""
+    host: Annotated[int, tyro.conf.arg(metavar="I")] = 0
+    """Which of them this is, from 0; 0 writes the results."""
+    coordinator: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS:PORT")] = None
+    """A free port of host 0, where the others find it."""
     quiet: bool = False
     """No progress."""
     json: bool = False
@@ -70,15 +84,16 @@ class Trials:
         )
         if not 1 <= self.runs <= MOST_RUNS:
             raise UsageError(f"--runs must be from 1 to {MOST_RUNS}, not {self.runs}")
+        self._check_hosts()
         options = options_of_method(self.preset, self.config)
-        mesh = _devices(self.devices)
+        mesh = self._mesh()
         import jax
         import jax.numpy as jnp
         import numpy as np
         from tqdm import tqdm
 
         from linemap_jax.io.table import ResultsTable
-        from linemap_jax.lab.batch import run_chunks
+        from linemap_jax.lab.batch import run_chunks, told_by_the_first
         from linemap_jax.lab.scanners import PRESETS
         from linemap_jax.lab.trials import Conditions, Trial, columns_of, recommend, summary, sweep, trial
 
@@ -108,10 +123,10 @@ class Trials:
 
         batches = max(1, CHUNK_RUNS // (BATCH_RUNS * mesh.size))
         chunk = BATCH_RUNS * batches * mesh.size
-        told = {k: v for k, v in dataclasses.asdict(self).items() if k not in ("output", "devices", "quiet", "json")}
+        told = {name: value for name, value in dataclasses.asdict(self).items() if name not in NO_MATTER}
         told |= {"config": self.config and self.config.read_text(encoding="utf-8")}
-        table = ResultsTable(self.output, told)
-        total, done = self.runs * len(varied), table.rows
+        table = ResultsTable(self.output, told) if self.host == 0 else None
+        total, done = self.runs * len(varied), told_by_the_first(table.rows if table else 0)
         if done % chunk and done < total:
             raise UsageError(f"{self.output} holds {done} drives, which are no chunks of {chunk}: give --devices")
         # All variants of one drive stand side by side.
@@ -126,7 +141,9 @@ class Trials:
         ) as progress:
             common = (noise, conditions)
             chunks = run_chunks(experiment, runs, *common, mesh=mesh, batch=BATCH_RUNS, batches=batches, start=done)
-            for first, rows in chunks if done < total else ():
+            for first, rows in _until_lost(chunks, self.output) if done < total else ():
+                if table is None:
+                    continue
                 here = slice(first, first + len(rows.lines))
                 which = [varied[i] for i in variant[here]]
                 columns: dict[str, Any] = {"drive": drive[here]}
@@ -135,6 +152,8 @@ class Trials:
                 table.append(first, columns | columns_of(rows))
                 progress.update(len(rows.lines))
         seconds = time.perf_counter() - started
+        if table is None:
+            return 0
         results = table.read()
         speed = {"seconds": seconds, "drives_per_second": (total - done) / seconds}
         if self.sweep:
@@ -161,21 +180,63 @@ class Trials:
             print(f"{total} drives -> {self.output}")
         return 0
 
+    def _check_hosts(self) -> None:
+        if not 1 <= self.hosts or not 0 <= self.host < self.hosts:
+            raise UsageError(f"--host must be from 0 to --hosts less one, not {self.host} of {self.hosts}")
+        if (self.hosts > 1) != (self.coordinator is not None):
+            raise UsageError("several --hosts need a --coordinator, and one host needs none")
 
-def _devices(count: int | None) -> "Mesh":
-    """So many devices in a row; of processors, as many as the machine has."""
-    processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    import jax
+    def _mesh(self) -> "Mesh":
+        """The devices in a row; of processors, as many as the machine has."""
+        processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        import jax
 
-    # Without effect where jax has counted its devices already, or where they are accelerators.
-    with contextlib.suppress(RuntimeError):
-        jax.config.update("jax_num_cpu_devices", processors)
-    from linemap_jax.lab.batch import mesh_of_devices
+        # Without effect where jax has counted its devices already, or where they are accelerators.
+        with contextlib.suppress(RuntimeError):
+            jax.config.update("jax_num_cpu_devices", processors)
+        if self.hosts > 1:
+            self._connect()
+        from linemap_jax.lab.batch import mesh_of_devices
+
+        try:
+            return mesh_of_devices(self.devices)
+        except ValueError as error:
+            raise UsageError(f"--devices: {error}") from error
+
+    def _connect(self) -> None:
+        """Join the other hosts."""
+        import jax
+
+        assert self.coordinator is not None
+        address, _, port = self.coordinator.rpartition(":")
+        if not address or not port.isdigit():
+            raise UsageError(f"--coordinator must be ADDRESS:PORT, not {self.coordinator}")
+        # Of a coordinator that is not there, jax would tell by ending the process.
+        latest = time.monotonic() + LONGEST_WAIT
+        while self.host > 0:
+            try:
+                socket.create_connection((address, int(port)), timeout=LONGEST_WAIT).close()
+                break
+            except OSError as error:
+                if time.monotonic() > latest:
+                    raise UsageError(f"--coordinator: there is no host 0 at {self.coordinator} ({error})") from error
+                time.sleep(0.2)
+        # gloo talks on the standard output, which is for results.
+        sys.stdout = os.fdopen(os.dup(1), "w")
+        os.dup2(2, 1)
+        jax.config.update("jax_cpu_collectives_implementation", "gloo")
+        jax.distributed.initialize(self.coordinator, self.hosts, self.host)
+
+
+def _until_lost(chunks: Iterator[Any], output: Path) -> Iterator[Any]:
+    """The chunks, while all hosts are there."""
+    from linemap_jax.lab.batch import LostProcess
 
     try:
-        return mesh_of_devices(count)
-    except ValueError as error:
-        raise UsageError(f"--devices: {error}") from error
+        yield from chunks
+    except LostProcess as error:
+        print(f"linemap: {error}; what was done stands in {output}, to go on with", file=sys.stderr, flush=True)
+        os._exit(2)  # the usual way out would wait for the host that is gone
 
 
 def _sweep_in_words(scores: list[dict[str, Any]], recommended: dict[str, float]) -> str:

@@ -65,10 +65,50 @@ def extract(
     Raises:
       ValueError: at trace time, for an option that does not exist.
     """
-    dtype = scan.ranges.dtype
-    thresholds, noise, mount = with_defaults(thresholds, noise, mount, dtype)
-    pose = as_dtype(pose, dtype)
-    scan, pose, finite = usable(scan, pose)
+    _, _, found = observe(
+        scan,
+        pose,
+        *with_defaults(thresholds, noise, mount, scan.ranges.dtype),
+        capacity=capacity,
+        rules=rules,
+        segmentation=segmentation,
+        covariance=covariance,
+        jacobians=jacobians,
+    )
+    return found
+
+
+def observe(
+    scan: Scan,
+    pose: Pose,
+    thresholds: Thresholds,
+    noise: SensorNoise,
+    mount: Mount,
+    *,
+    capacity: Capacity,
+    rules: Rules,
+    segmentation: Segmentation,
+    covariance: Covariance,
+    jacobians: Jacobians,
+) -> tuple[Points, Pose, Extraction]:
+    """`extract`, with all that a map is updated by.
+
+    Args:
+      scan: `N` beams.
+      pose: of the robot.
+      thresholds: criteria of the extraction, as arrays of the dtype of the scan; see `with_defaults`.
+      noise: of the sensor, likewise.
+      mount: of the scanner on the robot, likewise.
+      capacity: as for `extract`, and so are the others.
+      rules: which reading of the method.
+      segmentation: how points are divided into lines.
+      covariance: "exact" or "printed".
+      jacobians: "autodiff" or "analytic".
+
+    Returns:
+      The points; the pose, made finite; and what the points hold.
+    """
+    scan, pose, finite = usable(scan, as_dtype(pose, scan.ranges.dtype))
     points = points_from_scan(scan, pose, mount, jacobians=jacobians)
     found = extract_points(
         points,
@@ -81,7 +121,8 @@ def extract(
         covariance=covariance,
         jacobians=jacobians,
     )
-    return dataclasses.replace(found, status=found.status | jnp.where(finite, 0, int(Status.POSE_NOT_FINITE)))
+    status = found.status | jnp.where(finite, 0, int(Status.POSE_NOT_FINITE)).astype(jnp.int32)
+    return points, pose, dataclasses.replace(found, status=status)
 
 
 def usable(scan: Scan, pose: Pose) -> tuple[Scan, Pose, Bool[Array, ""]]:

@@ -21,7 +21,7 @@ from linemap_jax.core.runs import Runs
 from linemap_jax.core.segmentation.incremental import Run, gap_gate
 from linemap_jax.core.sensor import Points, cov_point
 from linemap_jax.core.settings import Covariance, Jacobians, Rules, SensorNoise, Thresholds
-from linemap_jax.core.slots import neutral_where_free
+from linemap_jax.core.slots import earliest_true, latest_true, neutral_where_free
 from linemap_jax.core.state import Lines, Pose, pytree
 
 MIN_POINTS = 3
@@ -302,7 +302,7 @@ def _at_corners(
     `UNSURE_SIGMAS` of the line next to it in the sweep is left out of the fit, with all points beyond it; unless these
     are more than a third, as where two pieces of one wall follow each other, or too few would be left.
     """
-    index = jnp.arange(runs.of_point.shape[0])
+    index = jnp.arange(runs.of_point.shape[0], dtype=jnp.int32)
     count = runs.valid.shape[0]
     most = jnp.minimum(size / 3, (size - MIN_POINTS) / 2)
     left_out = jnp.zeros(index.shape, bool)
@@ -314,13 +314,14 @@ def _at_corners(
         across = dot(there[:, :2], points.position - there[:, 2:])
         along_beam = dot(there[:, :2], points.beam) ** 2
         variance = noise.range_sigma**2 * along_beam + (points.range * noise.bearing_sigma) ** 2 * (1 - along_beam)
-        far = across**2 > UNSURE_SIGMAS**2 * variance
-        # The outermost point that is surely the run's own
-        mine = (runs.of_point[None] == jnp.arange(count)[:, None]) & far[None]
-        outermost = jnp.max(jnp.where(mine, side * index[None], -index.shape[0]), -1)
-        last = jnp.where(side > 0, runs.last, -runs.first)
-        trims = exists & (last - outermost <= most)
-        left_out |= trims[runs.of_point] & (side * index > outermost[runs.of_point])
+        own = (runs.of_point >= 0) & (across**2 > UNSURE_SIGMAS**2 * variance)
+        # How many points of the run come beyond the outermost one that is surely its own
+        if side > 0:
+            beyond, from_end = runs.last - latest_true(own)[runs.last], runs.last[runs.of_point] - index
+        else:
+            beyond, from_end = earliest_true(own)[runs.first] - runs.first, index - runs.first[runs.of_point]
+        trimmed = jnp.where(exists & (beyond <= most), beyond, 0)[runs.of_point]
+        left_out |= from_end < trimmed
     return left_out
 
 

@@ -15,14 +15,15 @@ from jaxtyping import Array, Bool, Int
 
 from linemap_jax.core import fusion, matching, wiping
 from linemap_jax.core.circles import near_lines
-from linemap_jax.core.extract import as_dtype, extract_points, usable, with_defaults
-from linemap_jax.core.sensor import Points, points_from_scan
+from linemap_jax.core.extract import as_dtype, observe, with_defaults
+from linemap_jax.core.sensor import Points
 from linemap_jax.core.settings import (
     SCAN_CAPACITY,
     Capacity,
     Covariance,
     Jacobians,
     Mount,
+    Number,
     Persistence,
     PoseError,
     Rules,
@@ -101,25 +102,50 @@ def update(
     if line_map.lines.offset.dtype != dtype:
         raise ValueError(f"the map is {line_map.lines.offset.dtype} and the scan {dtype}; make both the same")
     thresholds, noise, mount = with_defaults(thresholds, noise, mount, dtype)
-    lasting = as_dtype(persistence_of(pose_error, persistence), dtype)
-    pose = as_dtype(pose, dtype)
-    scan, pose, finite = usable(scan, pose)
-    points = points_from_scan(scan, pose, mount, jacobians=jacobians)
-    found = extract_points(
-        points,
+    points, pose, found = observe(
+        scan,
         pose,
         thresholds,
         noise,
+        mount,
         capacity=capacity,
         rules=rules,
         segmentation=segmentation,
         covariance=covariance,
         jacobians=jacobians,
     )
+    lasting = as_dtype(persistence_of(pose_error, persistence), dtype)
+    return integrate(line_map, points, pose, found, thresholds, noise, lasting, pose_error=pose_error, rules=rules)
 
+
+def integrate(
+    line_map: LineMap,
+    points: Points,
+    pose: Pose,
+    found: Extraction,
+    thresholds: Thresholds,
+    noise: SensorNoise,
+    lasting: Persistence,
+    *,
+    pose_error: PoseError,
+    rules: Rules,
+) -> tuple[LineMap, Report]:
+    """`update`, from the lines and circles of the scan on: match, fuse or add, merge, wipe.
+
+    Args:
+      line_map: the map so far.
+      points: the points of the scan, whose beams wipe.
+      pose: of the robot, finite.
+      found: what the points hold; see `observe`.
+      thresholds: gates, and how far wiping reaches.
+      noise: of the sensor.
+      lasting: what of the pose error persists, by `persistence_of`.
+      pose_error: as for `update`.
+      rules: which reading of the method.
+    """
     if pose_error == "persistent":
         # A scan without returns is none, so that a chunk may be filled up with such.
-        kept = jnp.where(jnp.any(scan.valid), jnp.square(lasting.correlation), 1)
+        kept = jnp.where(jnp.any(points.valid), jnp.square(lasting.correlation), 1)
         line_map = dataclasses.replace(
             line_map,
             lines=fusion.forget(line_map.lines, kept),
@@ -139,8 +165,7 @@ def update(
         lasting.share,
     )
 
-    status = found.status | jnp.where(finite, 0, int(Status.POSE_NOT_FINITE))
-    status |= jnp.where(lines.overflow | swept.wiped.overflow, int(Status.MAP_LINES_FULL), 0)
+    status = found.status | jnp.where(lines.overflow | swept.wiped.overflow, int(Status.MAP_LINES_FULL), 0)
     status |= jnp.where(circles.overflow, int(Status.MAP_CIRCLES_FULL), 0)
     report = Report(
         line_slot=lines.slot,
@@ -182,7 +207,7 @@ def _update_lines(
     thresholds: Thresholds,
     rules: Rules,
     pose_error: PoseError,
-    share: Array,
+    share: Number,
 ) -> _LineUpdate:
     """Section 5.1: match, then fuse or add, then merge."""
     new = found.lines
@@ -359,7 +384,7 @@ def _update_circles(
     thresholds: Thresholds,
     rules: Rules,
     pose_error: PoseError,
-    share: Array,
+    share: Number,
 ) -> _CircleUpdate:
     """Section 5.2: match, then fuse or add; and none too close to a line."""
     new = fusion.forget(found.circles, share)

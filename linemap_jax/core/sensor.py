@@ -8,16 +8,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from linemap_jax.core.frames import rotate, unit
+from linemap_jax.core.frames import rotate, unit, wrap_angle
 from linemap_jax.core.propagation import jacobian, propagate
 from linemap_jax.core.settings import Jacobians, Mount, SensorNoise
-from linemap_jax.core.slots import all_true, computed_once
+from linemap_jax.core.slots import computed_once
 from linemap_jax.core.state import Pose, Scan, pytree
 
 
 @pytree
 class Points:
-    """The returns of a scan as points, without gaps: those of the first beams that returned stand first.
+    """The returns of a scan as points, without gaps, in the order of the sweep.
 
     Positions are relative to the robot's, in the axes of the world.
     """
@@ -103,7 +103,7 @@ def points_from_scan(scan: Scan, pose: Pose, mount: Mount, *, jacobians: Jacobia
     at = jnp.stack([jnp.asarray(mount.x), jnp.asarray(mount.y), jnp.asarray(mount.theta)]).astype(here.dtype)
 
     n = scan.ranges.shape[0]
-    order = all_true(scan.valid, n)
+    order = _in_order(scan)
     valid = order < n
 
     def of_beam(index: Int[Array, " M"]) -> tuple[Array, Array, Array]:
@@ -125,7 +125,7 @@ def points_from_scan(scan: Scan, pose: Pose, mount: Mount, *, jacobians: Jacobia
         position=jax.vmap(lambda s: point_from_measurement(here, s, at))(measurement),
         beam=beam,
         range=range_,
-        turn=jnp.abs(bearing - jnp.concatenate([bearing[:1], bearing[:-1]])),
+        turn=jnp.abs(wrap_angle(bearing - jnp.concatenate([bearing[:1], bearing[:-1]]))),
         valid=valid,
         index=order,
         jac_pose=jax.vmap(lambda s: by_pose(here, s))(measurement),
@@ -133,3 +133,15 @@ def points_from_scan(scan: Scan, pose: Pose, mount: Mount, *, jacobians: Jacobia
         laser=rotate(here[2], at[:2]),
         spacing=scan.spacing,
     )
+
+
+def _in_order(scan: Scan) -> Int[Array, " N"]:
+    """The beams that returned, from the first one of the sweep on; `N` where there are no more.
+
+    One sort, as `all_true` of the beams turned back by `first`.
+    """
+    n = scan.valid.shape[0]
+    beam = jnp.arange(n, dtype=jnp.int32) - scan.first.astype(jnp.int32)
+    sorted_ = jnp.sort(jnp.where(scan.valid, jnp.where(beam < 0, beam + n, beam), n))
+    back = sorted_ + scan.first.astype(jnp.int32)
+    return jnp.where(sorted_ < n, jnp.where(back < n, back, back - n), n)

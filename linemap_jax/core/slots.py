@@ -42,6 +42,23 @@ def rank_of_true(which: Bool[Array, " N"]) -> Int[Array, " N"]:
     return jax.lax.scan(step, jnp.zeros((), jnp.int32), which.astype(jnp.int32))[1]
 
 
+def latest_true(which: Bool[Array, " N"]) -> Int[Array, " N"]:
+    """Index of the last true one up to each; -1 where there is none."""
+
+    def step(latest: Array, x: tuple[Array, Array]) -> tuple[Array, Array]:
+        index, one = x
+        latest = jnp.where(one, index, latest)
+        return latest, latest
+
+    index = jnp.arange(which.shape[0], dtype=jnp.int32)
+    return jax.lax.scan(step, jnp.full((), -1, jnp.int32), (index, which))[1]
+
+
+def earliest_true(which: Bool[Array, " N"]) -> Int[Array, " N"]:
+    """Index of the first true one from each on; `N` where there is none."""
+    return which.shape[0] - 1 - latest_true(which[::-1])[::-1]
+
+
 def least(score: Float[Array, "L K"]) -> tuple[Int[Array, " L"], Float[Array, " L"]]:
     """Where in each row the least number stands, the first of equal ones, and that number."""
     value = jnp.min(score, -1)

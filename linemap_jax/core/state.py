@@ -15,6 +15,8 @@ import numpy as np
 from jax import export
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
+from linemap_jax.core.sweep import close_sweep
+
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
 def pytree(cls: type) -> Any:
@@ -33,8 +35,8 @@ def _exportable(cls: type) -> type:
     export.register_pytree_node_serialization(
         cls,
         serialized_name=f"{cls.__module__}.{cls.__qualname__}",
-        serialize_auxdata=lambda names: json.dumps(names).encode(),
-        deserialize_auxdata=lambda names: tuple(json.loads(names)),
+        serialize_auxdata=lambda aux_data: json.dumps(aux_data).encode(),
+        deserialize_auxdata=lambda serialized_aux_data: tuple(json.loads(serialized_aux_data)),
     )
     return cls
 
@@ -55,6 +57,20 @@ class Status(enum.IntFlag):
     """The pose or its covariance held NaN or infinity; the scan was left out."""
 
 
+@jax.jit  # step by step, some thirty operations would be compiled one by one
+def _judged(
+    r: Float[Array, " N"], b: Float[Array, " N"], range_min: ArrayLike, range_max: ArrayLike
+) -> dict[str, Array]:
+    """The fields of `Scan.from_ranges`."""
+    finite = jnp.isfinite(b)
+    valid = jnp.isfinite(r) & (r > 0) & (r >= range_min) & (r < range_max) & finite
+    step = jnp.abs(jnp.diff(b)) if r.size > 1 else jnp.zeros(1, r.dtype)
+    spacing = jnp.nan_to_num(jnp.nanmedian(jnp.where(jnp.isfinite(step), step, jnp.nan))).astype(r.dtype)
+    r, b = jnp.where(valid, r, 0), jnp.where(finite, b, 0)
+    valid, first = close_sweep(r, b, valid, spacing)
+    return {"ranges": jnp.where(valid, r, 0), "bearings": b, "valid": valid, "spacing": spacing, "first": first}
+
+
 @pytree
 class Scan:
     """One range scan in the frame of the sensor.
@@ -66,6 +82,7 @@ class Scan:
     bearings: Float[Array, " N"]  # rad
     valid: Bool[Array, " N"]
     spacing: Float[Array, ""]  # rad, between neighbouring beams
+    first: Int[Array, ""]  # beam at which the sweep begins: 0, unless it closes on itself
 
     @classmethod
     def from_ranges(
@@ -73,11 +90,12 @@ class Scan:
     ) -> "Scan":
         """Build a scan from measured ranges; masks NaN, infinity, zero, negative and out-of-range readings.
 
-        A reading of exactly `range_max` is a no-return: scanners report "nothing seen" that way.
+        A reading of exactly `range_max` is a no-return: scanners report "nothing seen" that way. A sweep that closes on
+        itself has no seam: it begins where the surface breaks, and a beam measured twice counts once.
 
         Args:
           ranges: measured ranges in metres, in the order of the sweep. Shape `[N]`; its dtype is kept.
-          bearings: angle of each beam in radians, counter-clockwise. Shape `[N]`.
+          bearings: angle of each beam in radians, counter-clockwise; may fall from beam to beam. Shape `[N]`.
           range_min: smallest range that counts as a return, in metres (inclusive).
           range_max: ranges from here on are no-returns, in metres.
 
@@ -91,16 +109,7 @@ class Scan:
         b = jnp.asarray(bearings, r.dtype)
         if r.ndim != 1 or r.shape != b.shape:
             raise ValueError(f"ranges {r.shape} and bearings {b.shape} must be one-dimensional and of one length")
-        finite = jnp.isfinite(b)
-        valid = jnp.isfinite(r) & (r > 0) & (r >= range_min) & (r < range_max) & finite
-        step = jnp.abs(jnp.diff(b)) if r.size > 1 else jnp.zeros(1, r.dtype)
-        spacing = jnp.nan_to_num(jnp.nanmedian(jnp.where(jnp.isfinite(step), step, jnp.nan)))
-        return cls(
-            ranges=jnp.where(valid, r, 0),
-            bearings=jnp.where(finite, b, 0),
-            valid=valid,
-            spacing=spacing.astype(r.dtype),
-        )
+        return cls(**_judged(r, b, range_min, range_max))
 
 
 @pytree

@@ -33,10 +33,8 @@ from pathlib import Path
 
 import numpy as np
 
-from linemap_jax.io.log import LogError, Notes, Progress, Reading
-
-RANGE_MAX = 50.0
-"""m, where the log states no maximum range: below the no-return values seen in such logs (50.0 to 81.91 m)."""
+from linemap_jax.io.frames import poses_of_sweep
+from linemap_jax.io.log import RANGE_MAX, LogError, Notes, Options, Progress, Reading
 
 MAX_LINE = 1 << 20
 """Bytes. A longer line is no message (1 MiB holds some hundred thousand ranges) and is never held in memory."""
@@ -96,26 +94,19 @@ class CarmenLog:
 
     Attributes:
       path: the file.
+      format: what it is, in words.
       notes: what was noticed in the latest pass over the file.
       progress: called now and then with the bytes consumed and the bytes in all, as they lie on the disk.
     """
 
-    def __init__(
-        self,
-        path: str | os.PathLike[str],
-        *,
-        strict: bool = False,
-        range_max: float | None = None,
-        bearing_override: tuple[float, float] | None = None,
-        progress: Progress | None = None,
-    ) -> None:
-        """A reader of the file `path`; the arguments are those of `linemap_jax.io.log.open_log`."""
+    format = "CARMEN log"
+
+    def __init__(self, path: str | os.PathLike[str], options: Options, *, progress: Progress | None = None) -> None:
+        """A reader of the file `path`; the options are those of `linemap_jax.io.log.open_log`."""
         self.path = Path(path)
         self.notes = Notes()
         self.progress: Progress | None = progress
-        self._strict = strict
-        self._range_max = range_max
-        self._bearing_override = bearing_override
+        self._options = options
 
     def __iter__(self) -> Iterator[Reading]:
         """Stream the scans in the order of the file.
@@ -125,7 +116,9 @@ class CarmenLog:
             first malformed line.
         """
         notes = self.notes = Notes()
-        parser = _Parser(notes, self._range_max, self._bearing_override)
+        given = self._options.poses
+        notes.poses = "of the laser, as the log states them" if given is None else given.description
+        parser = _Parser(notes, self._options)
         with _opened(self.path) as (file, stream):
             size = os.fstat(file.fileno()).st_size
             reported = -1
@@ -137,11 +130,13 @@ class CarmenLog:
                 try:
                     reading = parser.reading(number, line)
                 except _Fault as fault:
-                    if self._strict:
+                    if self._options.strict:
                         raise LogError(self.path, str(fault), f"line {number}") from None
                     notes.skip(number, str(fault))
                     continue
-                if reading is not None:
+                if reading is not None and reading.pose is None and self._options.need_poses:
+                    notes.without_pose += 1
+                elif reading is not None:
                     notes.deliver(number, reading.timestamp, reading.ranges.size)
                     yield reading
             if self.progress is not None:
@@ -194,10 +189,9 @@ def assumed_sweep(beams: int) -> tuple[float, float]:
 class _Parser:
     """Lines to readings; holds what one pass over a log has to remember."""
 
-    def __init__(self, notes: Notes, range_max: float | None, bearing_override: tuple[float, float] | None) -> None:
+    def __init__(self, notes: Notes, options: Options) -> None:
         self._notes = notes
-        self._range_max = range_max
-        self._bearing_override = bearing_override
+        self._options = options
         self._form: dict[str, bytes] = {}  # by laser: the form whose scans are delivered
         self._trailing: dict[str, int] = {}  # by form: how many of the three trailing fields its lines have
         self._sweep: tuple[float, float, int] | None = None
@@ -231,7 +225,7 @@ class _Parser:
         beams = self._beams(name, fields, 0, 1 + len(_OLD_TAIL))
         ranges = _numbers(fields[1 : 1 + beams], "range")
         tail = self._tail(name, fields[1 + beams :], _OLD_TAIL)
-        if self._bearing_override is None and beams not in _SWEEPS:
+        if self._options.bearing_override is None and beams not in _SWEEPS:
             self._notes.assume(
                 f"the log does not state the bearings of its {beams} beams, they were spread over 180 degrees"
                 if beams > 1
@@ -247,13 +241,13 @@ class _Parser:
         if len(fields) < 9 + beams + remissions + len(_NEW_TAIL):
             raise _Fault(f"the {name} message has too few fields for the {remissions} remissions that it states")
         tail = self._tail(name, fields[9 + beams + remissions :], _NEW_TAIL)
-        if self._bearing_override is None and not _is_sweep(start, step, beams):
+        if self._options.bearing_override is None and not _is_sweep(start, step, beams):
             raise _Fault(
                 f"start_angle {start:g} and angular_resolution {step:g} of {beams} beams are no sweep in radians"
             )
         if not range_max > 0:
             range_max = RANGE_MAX
-            if self._range_max is None:
+            if self._options.range_max is None:
                 self._notes.assume(f"the log states no maximum range that is positive, {RANGE_MAX:g} m was taken")
         return self._made(number, ranges, (start, step), range_max, tail)
 
@@ -300,20 +294,28 @@ class _Parser:
     def _made(
         self, number: int, ranges: np.ndarray, sweep: tuple[float, float], range_max: float, tail: np.ndarray
     ) -> Reading:
-        first, step = self._bearing_override or sweep
+        options = self._options
+        first, step = options.bearing_override or sweep
         if self._sweep != (first, step, ranges.size):
             self._sweep = (first, step, ranges.size)
             self._bearings = first + step * np.arange(ranges.size)
             self._bearings.setflags(write=False)
+        stamp, pose = float(tail[-1]), tail[:3].copy()
+        if options.poses is not None:
+            known = poses_of_sweep(options.poses, stamp, 0.0, ranges.size)
+            pose = None if known is None else known[0]
         return Reading(
-            timestamp=float(tail[-1]),
+            timestamp=stamp,
             ranges=ranges,
             bearings=self._bearings,
-            range_max=range_max if self._range_max is None else float(self._range_max),
-            pose=tail[:3].copy(),
-            pose_frame="laser",
+            range_min=options.range_min or 0.0,
+            range_max=range_max if options.range_max is None else float(options.range_max),
+            pose=pose,
+            cov_pose=None,
+            sweep_poses=None,
+            pose_frame="laser" if options.poses is None else "robot",
             odometry=tail[3:6].copy(),
-            mount=None,
+            mount=None if options.poses is None else options.mount,
             where=f"line {number}",
         )
 
@@ -401,6 +403,8 @@ def _told(text: bytes) -> str:
 
 
 def _no_scan(notes: Notes) -> str:
+    if notes.without_pose:
+        return f"none of its {notes.without_pose} scans lies in the time that the given poses cover"
     seen = ", ".join(f"{count} {name}" for name, count in notes.messages.items())
     fault = f"; {notes.skipped} of them malformed, the first fault in {notes.first_fault}" if notes.skipped else ""
     return f"no laser scan found (FLASER, RLASER, ROBOTLASER1 or ROBOTLASER2), lines seen: {seen}{fault}"

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from linemap_jax.io.atomic import atomic_write
-from linemap_jax.io.carmen import RANGE_MAX, assumed_sweep
+from linemap_jax.io.carmen import assumed_sweep
+from linemap_jax.io.log import RANGE_MAX
 
 NO_RETURN = 81.91
 """m, what scanners report in `FLASER` messages where nothing was seen."""

@@ -1,10 +1,13 @@
-"""Settings from a TOML file."""
+"""Settings from a TOML file, and into one."""
 
+import ast
 import dataclasses
 import difflib
+import inspect
 import os
+import textwrap
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +62,36 @@ def read_config(path: str | os.PathLike[str]) -> dict[str, dict[str, Any]]:
             if section == "persistence" and value > 1:
                 raise ConfigError(f"{os.fspath(path)}: {key} in [{section}] must be at most 1, not {value}")
     return tables
+
+
+def config_text(settings: Mapping[str, Any]) -> str:
+    """Settings as TOML that `read_config` reads, each key under a comment that tells its meaning and unit.
+
+    Args:
+      settings: for each table, an instance of its class in `SECTIONS`, of plain numbers.
+    """
+    blocks = []
+    for section, instance in settings.items():
+        lines = [f"[{section}]"]
+        for name, meaning in _meanings(SECTIONS[section]).items():
+            value = getattr(instance, name)
+            told = str(value).lower() if isinstance(value, bool) else repr(value)
+            lines += [*textwrap.wrap(meaning, 96, initial_indent="# ", subsequent_indent="# "), f"{name} = {told}"]
+        blocks.append("\n".join(lines))
+    return "\n\n".join(blocks) + "\n"
+
+
+def _meanings(cls: type) -> dict[str, str]:
+    """The fields of a class and the strings below them, which Python itself does not keep."""
+    (definition,) = ast.parse(textwrap.dedent(inspect.getsource(cls))).body
+    assert isinstance(definition, ast.ClassDef)
+    body = definition.body
+    return {
+        field.target.id: " ".join(text.value.value.split())
+        for field, text in zip(body, body[1:], strict=False)
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)
+        if isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant) and isinstance(text.value.value, str)
+    }
 
 
 def _nearest(name: str, known: Iterable[str]) -> str:

@@ -53,7 +53,8 @@ def write_dxf(
     for center, (minor, major) in zip(circles.center[circles.fitted].tolist(), axes.swapaxes(1, 2), strict=True):
         ratio = float(np.linalg.norm(minor) / np.linalg.norm(major))
         space.add_ellipse(center, major.tolist(), max(ratio, _THINNEST), dxfattribs={"layer": "ELLIPSES"})
-    if trajectory is not None and len(driven := np.asarray(trajectory, float)):
+    driven = np.zeros((0, 2)) if trajectory is None else np.asarray(trajectory, float)
+    if len(driven := driven[np.isfinite(driven).all(1)]):
         space.add_lwpolyline(driven.tolist(), dxfattribs={"layer": "PATH"})
     with atomic_write(path, overwrite=overwrite) as temporary:
         document.saveas(temporary)

@@ -1,6 +1,7 @@
 """Extractions as JSON lines, one a scan."""
 
 import json
+import math
 from collections.abc import Iterator
 
 import jax
@@ -11,14 +12,14 @@ from linemap_jax.core.state import Extraction, Pose
 
 
 def lines_of_extraction(timestamps: np.ndarray, poses: Pose, found: Extraction) -> Iterator[str]:
-    """One JSON object a scan: `timestamp`, `pose`, `lines`, `circles`.
+    """One JSON object a scan: `timestamp`, `pose`, `lines`, `circles`; the pose is null where the log has none.
 
     A line has `rho`, `theta`, `cov` of both, `begin`, `end`; a circle `center`, `radius`, `cov` of (x, y, radius), and
     `fitted`, whether it is the pole itself or the visible points alone. SI units, radians, counter-clockwise.
 
     Args:
       timestamps: seconds. Shape `[T]`.
-      poses: as the log has them, stacked `[T]`.
+      poses: as the log has them, stacked `[T]`; NaN where it has none.
       found: the extractions, stacked `[T]`, in the frame of the sensor.
 
     Yields:
@@ -33,7 +34,7 @@ def lines_of_extraction(timestamps: np.ndarray, poses: Pose, found: Extraction) 
         yield json.dumps(
             {
                 "timestamp": stamp,
-                "pose": pose,
+                "pose": None if any(map(math.isnan, pose)) else pose,
                 "lines": [{name: x[t][k] for name, x in lines.items()} for k in np.flatnonzero(has_line[t])],
                 "circles": [{name: x[t][k] for name, x in circles.items()} for k in np.flatnonzero(has_circle[t])],
             },

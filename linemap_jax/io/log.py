@@ -15,8 +15,11 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 
+from linemap_jax.io.frames import Poses
+
 Progress = Callable[[int, int], None]
-"""Called with the bytes of the file consumed so far and the bytes in all, both as they lie on the disk."""
+"""Called with the bytes of the file consumed so far and the bytes in all, as they lie on the disk; of a bag by the time
+that has passed in it."""
 
 MAX_LISTED = 20
 """Notes list this many places of one kind; the count goes on."""
@@ -24,15 +27,18 @@ MAX_LISTED = 20
 MAX_GAP = 60.0
 """s. A longer gap between two scans is noted: the robot may have been carried meanwhile."""
 
+RANGE_MAX = 50.0
+"""m, where a log states no maximum range: below the no-return values seen in such logs (50.0 to 81.91 m)."""
+
+_BAGS = (b"#ROSBAG", b"\x89MCAP", b"SQLite format 3\0")
+
 # Formats that a user may well hand over; naming them says more than "unknown".
 _FOREIGN = {
-    b"#ROSBAG": "is a ROS bag, which cannot be read",
-    b"\x89MCAP": "is an MCAP file, which cannot be read",
-    b"SQLite format 3\0": "is an SQLite database (perhaps of a ROS 2 bag), which cannot be read",
     b"BZh": "is compressed with bzip2, unpack it first",
     b"\xfd7zXZ": "is compressed with xz, unpack it first",
-    b"\x28\xb5\x2f\xfd": "is compressed with zstd, unpack it first",
+    b"\x28\xb5\x2f\xfd": "is compressed with zstd: of a ROS 2 bag give the folder, anything else unpack first",
     b"PK\x03\x04": "is a zip archive, unpack it first",
+    b"\x89HDF": "is an HDF5 file, which cannot be read",
 }
 
 
@@ -64,14 +70,17 @@ class Reading:
     The arrays are float64. `bearings` is shared between readings and cannot be written to.
     """
 
-    timestamp: float  # s, of the message
+    timestamp: float  # s, of the first beam
     ranges: np.ndarray  # [N] m; may hold NaN, infinity, zero, negative and no-return values
-    bearings: np.ndarray  # [N] rad, counter-clockwise, in the frame of the laser; finite
+    bearings: np.ndarray  # [N] rad, counter-clockwise, in the frame of the laser, upright; finite
+    range_min: float  # m; ranges below are no-returns
     range_max: float  # m; ranges from here on are no-returns
-    pose: np.ndarray  # [3] x, y in m, theta in rad, in the world; finite
+    pose: np.ndarray | None  # [3] x, y in m, theta in rad, in the world, at the time stamp; finite. None if not known
+    cov_pose: np.ndarray | None  # [3, 3] of `pose`; positive definite. None if the log does not state it
+    sweep_poses: np.ndarray | None  # [N, 3] poses when each beam was measured; None if that makes no difference
     pose_frame: Literal["laser", "robot"]  # whose pose it is
     odometry: np.ndarray | None  # [3] x, y in m, theta in rad: odometry's pose of the robot, if the log has it
-    mount: tuple[float, float, float] | None  # m, m, rad: the laser on the robot, for a robot pose
+    mount: tuple[float, float, float] | None  # m, m, rad: the laser on the robot, for a robot pose; None if not known
     where: str  # place in the file, such as "line 412"
 
 
@@ -79,13 +88,23 @@ class Reading:
 class Notes:
     """What a reader noticed while reading. The counts are complete only once the log has been read to its end.
 
-    Lines are counted from 1; a format without lines counts its messages.
+    Lines are counted from 1; a format without lines counts its scans.
     """
 
+    unit: str = "line"  # what is counted
     lines: int = 0  # read so far
-    messages: dict[str, int] = field(default_factory=dict)  # lines by kind of message
+    messages: dict[str, int] = field(default_factory=dict)  # lines by kind of message, or messages by topic
+    types: dict[str, str] = field(default_factory=dict)  # of the messages of each topic
+    scan_topics: list[str] = field(default_factory=list)  # all that hold scans
+    frames: list[str] = field(default_factory=list)  # where frames are: "laser in base_link (static)"
+    poses: str = ""  # where the poses come from, in words
+    mounting: str = ""  # how the laser sits on the robot, in words
+    stated_covs: int = 0  # delivered scans whose pose comes with a covariance
+    swept: int = 0  # delivered scans whose beams were measured at different poses
     scans: int = 0  # delivered
-    beam_count: int | None = None  # beams of every delivered scan
+    beam_count: int | None = None  # beams of the first delivered scan
+    other_beam_counts: int = 0  # delivered scans with another number of beams
+    without_pose: int = 0  # scans left out: no pose is known for their time
     params: dict[str, str] = field(default_factory=dict)  # parameters that the log states; the latest value of each
     skipped: int = 0  # malformed lines, left out
     skipped_lines: list[int] = field(default_factory=list)  # the first of them
@@ -101,7 +120,7 @@ class Notes:
     def skip(self, line: int, fault: str) -> None:
         """Note a malformed line; `fault` says what is wrong with it."""
         if self.skipped == 0:
-            self.first_fault = f"line {line}: {fault}"
+            self.first_fault = f"{self.unit} {line}: {fault}"
         self.skipped += 1
         _list(self.skipped_lines, line)
 
@@ -114,7 +133,9 @@ class Notes:
             self.jumps += 1
             _list(self.jump_lines, line)
         self.last_stamp = timestamp
-        self.beam_count = beams
+        if self.beam_count is None:
+            self.beam_count = beams
+        self.other_beam_counts += beams != self.beam_count
         self.scans += 1
 
     def assume(self, sentence: str) -> None:
@@ -126,36 +147,62 @@ class Notes:
         """One sentence for each kind of thing that was odd; none if nothing was."""
         said = []
         if self.skipped:
-            lines = "line was" if self.skipped == 1 else "lines were"
+            lines = f"{self.unit} was" if self.skipped == 1 else f"{self.unit}s were"
             said.append(
-                f"{self.skipped} malformed {lines} skipped ({_places(self.skipped_lines, self.skipped)}); "
+                f"{self.skipped} malformed {lines} skipped ({self._places(self.skipped_lines, self.skipped)}); "
                 f"the first fault, {self.first_fault}"
             )
+        if self.without_pose:
+            were, their = ("was", "its") if self.without_pose == 1 else ("were", "their")
+            said.append(f"{_scans(self.without_pose)} {were} left out: no pose is known for {their} time")
         if self.backward_stamps:
             said.append(
                 f"the time stamp steps back at {_scans(self.backward_stamps)} "
-                f"({_places(self.backward_lines, self.backward_stamps)}); the order of the file was kept"
+                f"({self._places(self.backward_lines, self.backward_stamps)}); the order of the file was kept"
             )
         if self.jumps:
             said.append(
                 f"{_scans(self.jumps)} came more than {MAX_GAP:g} s after the scan before "
-                f"({_places(self.jump_lines, self.jumps)})"
+                f"({self._places(self.jump_lines, self.jumps)})"
             )
         for kind, count in self.duplicates.items():
             said.append(f"{count} {kind} lines were left out: the log has the scans of this laser in another form too")
+        if self.other_beam_counts:
+            others = f"{_scans(self.other_beam_counts)} with other than the {self.beam_count} of the first"
+            said.append(f"the number of beams varies: {others}")
         return said + self.assumptions
+
+    def _places(self, listed: list[int], count: int) -> str:
+        return f"{self.unit}{'' if count == 1 else 's'} {', '.join(map(str, listed))}{', ...' * (count > len(listed))}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """How a log is to be read: the arguments of `open_log`."""
+
+    strict: bool = False
+    range_min: float | None = None
+    range_max: float | None = None
+    bearing_override: tuple[float, float] | None = None
+    scan_topic: str | None = None
+    odom_topic: str | None = None
+    mount: tuple[float, float, float] | None = None
+    poses: Poses | None = None
+    need_poses: bool = True
 
 
 class Log(Protocol):
     """A log of scans: iterate over it to read it, as often as needed, each time from the start.
 
     Attributes:
-      path: the file.
+      path: the file, or the folder.
+      format: what it is, in words.
       notes: what was noticed in the latest pass over the file; a new pass begins new notes.
       progress: called now and then while reading; may be set at any time before a pass.
     """
 
     path: Path
+    format: str
     notes: Notes
     progress: Progress | None
 
@@ -172,18 +219,31 @@ def open_log(
     path: str | os.PathLike[str],
     *,
     strict: bool = False,
+    range_min: float | None = None,
     range_max: float | None = None,
     bearing_override: tuple[float, float] | None = None,
+    scan_topic: str | None = None,
+    odom_topic: str | None = None,
+    mount: tuple[float, float, float] | None = None,
+    poses: Poses | None = None,
+    need_poses: bool = True,
     progress: Progress | None = None,
 ) -> Log:
     """Choose the reader for a log by what the file holds. Nothing but its beginning is read yet.
 
     Args:
-      path: the log. A CARMEN log may be compressed with gzip, whatever its name.
-      strict: refuse a log with a malformed line, instead of skipping and counting such lines.
+      path: the log. A CARMEN log, which may be compressed with gzip, whatever its name; a ROS 1 bag; a ROS 2 bag, as a
+        folder with its `metadata.yaml` or as a single `.mcap` or `.db3` file.
+      strict: refuse a log with a malformed line or message, instead of skipping and counting such.
+      range_min: smallest range that is a return, m, in place of what the log states.
       range_max: the scanner's maximum range in metres, in place of what the log states or the reader would take.
       bearing_override: bearing of the first beam and step from beam to beam, both in radians, counter-clockwise, in
         place of what the log states or the reader would take.
+      scan_topic: of a bag with several scanners, the one to read.
+      odom_topic: of a bag, the `nav_msgs/Odometry` to take poses from.
+      mount: of the laser on the robot, m, m, rad, in place of what the log states; for poses that are the robot's.
+      poses: of the robot, in place of those of the log. Scans beyond them are left out and counted.
+      need_poses: whether a scan without a pose is of any use. If it is, such scans are delivered too.
       progress: called now and then while reading, with the bytes consumed and the bytes in all.
 
     Returns:
@@ -191,48 +251,70 @@ def open_log(
 
     Raises:
       LogError: if the file is missing, no regular file, empty, unreadable, or of an unknown format.
-      ValueError: if `range_max` is not positive or `bearing_override` is not a sweep.
+      ValueError: if a range or the mount is not finite and positive where it must be, or `bearing_override` is not a
+        sweep.
     """
     from linemap_jax.io import carmen  # The readers build on this module.
 
+    if range_min is not None and not 0 <= range_min < math.inf:
+        raise ValueError(f"range_min must be zero or positive, not {range_min}")
     if range_max is not None and not range_max > 0:
         raise ValueError(f"range_max must be positive, not {range_max}")
     if bearing_override is not None:
         first, step = bearing_override
         if not (abs(first) <= 2 * math.pi and 0 < abs(step) <= 2 * math.pi):
             raise ValueError(f"bearing_override must be a first bearing and a step in radians, not {bearing_override}")
+    if mount is not None and not all(map(math.isfinite, mount)):
+        raise ValueError(f"mount must be finite, not {mount}")
+    options = Options(
+        strict=strict,
+        range_min=range_min,
+        range_max=range_max,
+        bearing_override=bearing_override,
+        scan_topic=scan_topic,
+        odom_topic=odom_topic,
+        mount=mount,
+        poses=poses,
+        need_poses=need_poses,
+    )
+    magic = _magic(path)
+    if magic is None or magic.startswith(_BAGS):
+        from linemap_jax.io import bags  # Its libraries take a while to load.
+
+        return bags.BagLog(path, options, progress=progress)
+    for start, what in _FOREIGN.items():
+        if magic.startswith(start):
+            raise LogError(path, what)
+    if not carmen.recognise(path):
+        raise LogError(path, "is not a CARMEN log, nor a ROS bag: no format that can be read")
+    if scan_topic is not None or odom_topic is not None:
+        raise LogError(path, "is a CARMEN log, which has no topics to choose from")
+    return carmen.CarmenLog(path, options, progress=progress)
+
+
+def _magic(path: str | os.PathLike[str]) -> bytes | None:
+    """The first bytes of a file, None for the folder of a ROS 2 bag."""
     try:
         found = os.stat(path)
         if stat.S_ISDIR(found.st_mode):
-            raise LogError(path, "is a directory, not a log")
+            if (Path(path) / "metadata.yaml").exists():
+                return None
+            raise LogError(path, "is a directory, not a log, nor a ROS 2 bag with its metadata.yaml")
         if not stat.S_ISREG(found.st_mode):
             raise LogError(path, "is not a regular file")
         if found.st_size == 0:
             raise LogError(path, "the file is empty")
         with open(path, "rb") as file:
-            magic = file.read(16)
+            return file.read(16)
     except OSError as error:
         raise LogError(path, f"cannot be read: {error.strerror or error}") from error
     except ValueError as error:  # a NUL or an unencodable character in the name
         raise LogError(repr(path), f"cannot be read: {error}") from error
-    for start, what in _FOREIGN.items():
-        if magic.startswith(start):
-            raise LogError(path, what)
-    if not carmen.recognise(path):
-        raise LogError(path, "is not a CARMEN log, nor of another format that can be read")
-    return carmen.CarmenLog(
-        path, strict=strict, range_max=range_max, bearing_override=bearing_override, progress=progress
-    )
 
 
 def _list(places: list[Any], place: Any) -> None:
     if len(places) < MAX_LISTED:
         places.append(place)
-
-
-def _places(listed: list[int], count: int) -> str:
-    lines = "line" if count == 1 else "lines"
-    return f"{lines} {', '.join(map(str, listed))}{', ...' if count > len(listed) else ''}"
 
 
 def _scans(count: int) -> str:

@@ -54,6 +54,7 @@ def write_svg(
     """
     shapes = shapes_of_map(line_map, level)
     driven = np.zeros((0, 2)) if trajectory is None else np.asarray(trajectory, float)
+    driven = driven[np.isfinite(driven).all(1)]
     reach = shapes.radius[:, None]
     parts = (shapes.segments, shapes.bands, shapes.center - reach, shapes.center + reach, driven)
     points = np.concatenate([np.zeros((0, 2)), *(part.reshape(-1, 2) for part in parts)])

@@ -1,4 +1,4 @@
-"""Trajectories in the format of the TUM RGB-D benchmark, which tools for comparing trajectories read."""
+"""Trajectories in the format of the TUM RGB-D benchmark, which tools for comparing trajectories read and write."""
 
 import os
 
@@ -6,6 +6,50 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from linemap_jax.io.atomic import atomic_write
+from linemap_jax.io.frames import Trajectory, planar, transform_of
+from linemap_jax.io.log import LogError
+
+
+def read_tum(path: str | os.PathLike[str]) -> Trajectory:
+    """Read poses, one a line: `timestamp tx ty tz qx qy qz qw`, seen from above; lines that begin with # are comments.
+
+    Args:
+      path: of the file.
+
+    Raises:
+      LogError: if the file cannot be read, a line is no pose, or there is none; it names the line.
+    """
+    stamps, poses = [], []
+    try:
+        with open(path, encoding="utf-8") as file:
+            for number, line in enumerate(file, 1):
+                fields = line.replace(",", " ").split("#", 1)[0].split()
+                if not fields:
+                    continue
+                pose = _pose(fields)
+                if pose is None:
+                    raise LogError(path, "is no pose: timestamp tx ty tz qx qy qz qw", f"line {number}")
+                stamps.append(float(fields[0]))
+                poses.append(pose)
+    except OSError as error:
+        raise LogError(path, f"cannot be read: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise LogError(path, "is no text, so not a trajectory in the format of TUM") from error
+    if not stamps:
+        raise LogError(path, "holds no pose")
+    return Trajectory(np.array(stamps), np.array(poses))
+
+
+def _pose(fields: list[str]) -> tuple[float, float, float] | None:
+    """x, y and theta of a line, if it has a time stamp and a pose."""
+    try:
+        stamp, *numbers = map(float, fields)
+    except ValueError:
+        return None
+    if len(numbers) != 7 or not np.isfinite(stamp):
+        return None
+    transform = transform_of(numbers[:3], numbers[3:])
+    return None if transform is None else planar(transform)
 
 
 def write_tum(

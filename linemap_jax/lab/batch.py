@@ -23,6 +23,11 @@ from jaxtyping import Array
 Experiment = Callable[..., Any]
 """From what one run differs by, and what all have in common, to what it gives; all are pytrees of arrays."""
 
+
+class LostProcess(Exception):
+    """Another process of the run has ended or failed: one sentence, with what jax says of it."""
+
+
 AXIS = "runs"
 """The axis of a mesh over which runs are spread."""
 BATCH = 128
@@ -71,6 +76,7 @@ def run_chunks(
 
     Raises:
       ValueError: if there is no run, if leaves differ in their number, or if `start` lies within a chunk.
+      LostProcess: if another process has ended or failed. Where it was the first one, jax itself ends this one.
     """
     sizes = {np.shape(leaf)[0] if np.ndim(leaf) else 0 for leaf in jax.tree.leaves(runs)}
     if len(sizes) != 1 or sizes == {0}:
@@ -81,24 +87,36 @@ def run_chunks(
     if start % size:
         raise ValueError(f"start must be a multiple of the chunk of {size} runs, not {start}")
     sharding = NamedSharding(mesh, PartitionSpec(AXIS))
-    many = _many(experiment, mesh, batch)
+    run = many = _many(experiment, mesh, batch)
     for begin in range(start, count, size):
         # The last chunk is filled up with its last run, so that it fits the compiled program.
         index = np.minimum(np.arange(begin, begin + size), count - 1)
         chunk = jax.tree.map(partial(_spread, index=index, sharding=sharding), runs)
-        results = many((chunk, common))
-        if not _are_here(results):
-            results = multihost_utils.process_allgather(results, tiled=True)
+        if jax.process_count() > 1 and begin == start:
+            # To connect, gloo gives the processes half a minute; some may compile for longer than others.
+            run = many.lower((chunk, common)).compile()
+            multihost_utils.sync_global_devices("compiled")
+        results = _here(run((chunk, common)))
         yield begin, jax.tree.map(partial(_first, count=count - begin), results)
+
+
+def told_by_the_first(number: int) -> int:
+    """A number as the first process has it, in all processes."""
+    return int(multihost_utils.broadcast_one_to_all(np.int32(number)))
 
 
 def _first(leaf: Any, count: int) -> np.ndarray:
     return np.asarray(leaf)[:count]
 
 
-def _are_here(results: Any) -> bool:
-    """Whether this process can see all of the results; over several hosts it cannot."""
-    return all(x.is_fully_addressable for x in jax.tree.leaves(results))
+def _here(results: Any) -> Any:
+    """The results, all of them in this process; over several hosts each computes its share."""
+    if all(x.is_fully_addressable for x in jax.tree.leaves(results)):
+        return results
+    try:
+        return multihost_utils.process_allgather(results, tiled=True)
+    except (jax.errors.JaxRuntimeError, ValueError) as error:
+        raise LostProcess(f"another process of the run has ended or failed ({str(error).splitlines()[0]})") from error
 
 
 def run_batch(experiment: Experiment, runs: Any, *common: Any, **options: Any) -> Any:
@@ -115,7 +133,7 @@ def run_batch(experiment: Experiment, runs: Any, *common: Any, **options: Any) -
 
 
 @lru_cache(maxsize=64)
-def _many(experiment: Experiment, mesh: Mesh, batch: int) -> Callable[..., Any]:
+def _many(experiment: Experiment, mesh: Mesh, batch: int) -> jax.stages.Wrapped:
     """The compiled program for one chunk. Kept, since a new closure would be compiled anew."""
 
     def on_one_device(given: tuple[Any, tuple[Any, ...]]) -> Any:

@@ -210,12 +210,15 @@ def evaluate_log(
     return LogScore(total, share, met, median, most)
 
 
-def seen_in_log(world: World, chunks: Iterable[tuple[Scan, Pose]], *, chunk: int) -> tuple[Seen, int]:
+def seen_in_log(
+    world: World, chunks: Iterable[tuple[Scan, Pose]], mount: Mount | None = None, *, chunk: int
+) -> tuple[Seen, int]:
     """What the beams of a log, which comes piece by piece, have seen of a world; as `scoring.survey`.
 
     Args:
       world: the truth.
       chunks: stacked scans and poses, at most `chunk` of them each time.
+      mount: of the scanner on the robot.
       chunk: size to which pieces are filled up.
 
     Returns:
@@ -224,7 +227,7 @@ def seen_in_log(world: World, chunks: Iterable[tuple[Scan, Pose]], *, chunk: int
     seen, count = seen_nothing(world), 0
     for scans, poses in chunks:
         [(padded, places)] = _filled([(scans, poses)], chunk)
-        seen = survey(seen, world, padded, places.mean, first=jnp.asarray(count, jnp.int32))
+        seen = survey(seen, world, padded, places.mean, mount, first=jnp.asarray(count, jnp.int32))
         count += scans.ranges.shape[0]
     return seen, count
 

@@ -5,6 +5,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -12,9 +13,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from linemap_jax.core.extract import extract
-from linemap_jax.core.mapping import empty_map, update
-from linemap_jax.core.settings import Capacity, Number, SensorNoise, Thresholds
+from linemap_jax.core.extract import as_dtype, observe, with_defaults
+from linemap_jax.core.mapping import empty_map, integrate
+from linemap_jax.core.settings import (
+    Capacity,
+    Covariance,
+    Jacobians,
+    Number,
+    Persistence,
+    PoseError,
+    Rules,
+    Segmentation,
+    SensorNoise,
+    Thresholds,
+    persistence_of,
+)
 from linemap_jax.core.state import LineMap, Pose, Status, pytree
 from linemap_jax.lab import scoring
 from linemap_jax.lab.consistency import CHI2_95
@@ -84,7 +97,12 @@ def trial(
     scans: int,
     map_capacity: Capacity = Capacity(96, 48),
     capacity: Capacity = Capacity(24, 32),
-    **options: Any,
+    pose_error: PoseError = "unknown",
+    persistence: Persistence | None = None,
+    rules: Rules = Rules(),
+    segmentation: Segmentation = "incremental",
+    covariance: Covariance = "exact",
+    jacobians: Jacobians = "analytic",
 ) -> Outcome:
     """Drive along the path of a world, map what is seen, and hold the map against the truth.
 
@@ -94,7 +112,12 @@ def trial(
       scans: number of scans along the path.
       map_capacity: slots of the map.
       capacity: slots for what one scan holds.
-      **options: of `update`; not `thresholds` and `noise`, which are those of the run.
+      pose_error: as for `update`, and so are the others; thresholds and noise are those of the run.
+      persistence: for "persistent".
+      rules: which reading of the method.
+      segmentation: how points are divided into lines.
+      covariance: "exact" or "printed".
+      jacobians: "autodiff" or "analytic".
     """
     world, scanner = run.world, conditions.scanner
     dtype = world.dtype
@@ -104,15 +127,25 @@ def trial(
         of_poses, path, jnp.asarray(conditions.cov_pose, dtype), correlation=conditions.correlation
     )
     noise = noise_of(scanner) if run.noise is None else run.noise
-    options = {"jacobians": "analytic", "thresholds": run.thresholds, "noise": noise, "capacity": capacity} | options
-    of_extract = {k: v for k, v in options.items() if k not in ("pose_error", "persistence")}
+    thresholds, noise, mount = with_defaults(run.thresholds, noise, None, dtype)
+    lasting = as_dtype(persistence_of(pose_error, persistence), dtype)
+    look = partial(
+        observe,
+        capacity=capacity,
+        rules=rules,
+        segmentation=segmentation,
+        covariance=covariance,
+        jacobians=jacobians,
+    )
 
     def step(carry: tuple[LineMap, Seen], x: tuple[Array, Array, Pose, Array]) -> tuple[tuple[LineMap, Seen], Any]:
         before, seen = carry
         key, pose, estimate, index = x
         scan, truth = simulate_scan(key, world, pose, scanner, scan_index=index)
-        line_map, report = update(before, scan, estimate, **options)
-        found = extract(scan, estimate, **of_extract)
+        points, estimate, found = look(scan, estimate, thresholds, noise, mount)
+        line_map, report = integrate(
+            before, points, estimate, found, thresholds, noise, lasting, pose_error=pose_error, rules=rules
+        )
         matches = scoring.judge_matches(before.lines, found, report.line_slot, world, truth, scan_index=index)
         seen = scoring.look(seen, world, scan, truth, pose)
         beams = scoring.beams_on_objects(world, scan, truth, pose, scan_index=index)

@@ -147,7 +147,13 @@ def test_a_single_return_is_a_lone_point() -> None:
 
 @pytest.mark.parametrize("fit", [True, False])
 def test_equal_points_are_no_line(fit: bool) -> None:
-    scan = Scan(ranges=jnp.full(61, 2.0), bearings=jnp.full(61, 0.3), valid=jnp.ones(61, bool), spacing=jnp.array(0.01))
+    scan = Scan(
+        ranges=jnp.full(61, 2.0),
+        bearings=jnp.full(61, 0.3),
+        valid=jnp.ones(61, bool),
+        spacing=jnp.array(0.01),
+        first=jnp.array(0),
+    )
     found = extract(scan, ORIGIN, capacity=CAPACITY, **preset("default" if fit else "paper"))
     assert not found.lines.valid.any()
     assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(found))

@@ -2,6 +2,7 @@ import gzip
 import math
 import os
 import pickle
+import re
 import tracemalloc
 from pathlib import Path
 
@@ -10,8 +11,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from linemap_jax.io.carmen import MAX_LINE, RANGE_MAX, assumed_sweep
-from linemap_jax.io.log import LogError, Notes, Reading, open_log
+from linemap_jax.io.carmen import MAX_LINE, assumed_sweep
+from linemap_jax.io.frames import Trajectory
+from linemap_jax.io.log import RANGE_MAX, LogError, Notes, Reading, open_log
 
 DATA = Path(os.environ.get("LINEMAP_DATA", Path(__file__).parents[2] / "../shared/data")) / "carmen"
 POSE = (1.0, 2.0, 0.5)
@@ -428,8 +430,8 @@ def test_a_file_without_permission(write):
     ("content", "cause"),
     [
         (b"#ROSBAG V2.0\n", "ROS bag"),
-        (b"\x89MCAP0\r\n", "MCAP"),
-        (b"SQLite format 3\0", "SQLite"),
+        (b"\x89MCAP0\r\n", "ROS 2 bag"),
+        (b"SQLite format 3\0", "ROS 2 bag"),
         (b"BZh91AY", "bzip2"),
         (b"\xfd7zXZ\0", "xz"),
         (b"PK\x03\x04", "zip"),
@@ -444,9 +446,7 @@ def test_a_file_without_permission(write):
 def test_contents_of_other_kinds(tmp_path, content, cause):
     path = tmp_path / "x.log"
     path.write_bytes(content)
-    with pytest.raises(LogError, match=cause) as caught:
-        open_log(path)
-    assert str(path) in str(caught.value)
+    assert re.search(cause, refused(path))
 
 
 def test_a_log_without_a_scan_says_what_it_holds(write):
@@ -622,3 +622,20 @@ def test_real_logs(name, scans, beams, backward, jumps):
     assert log.notes.jumps == jumps
     assert (log.notes.beam_count, log.notes.skipped, log.notes.duplicates) == (beams, 0, {})
     assert len(log.notes.warnings()) == (backward > 0) + (jumps > 0)
+
+
+# Poses that somebody gives
+
+
+def test_given_poses_are_the_robots_and_scans_beyond_them_are_left_out(write):
+    lines = [flaser(trailing=f"{stamp} host 0.5") for stamp in (9.0, 10.0, 10.5, 11.0)]
+    poses = Trajectory(np.array([10.0, 11.0]), np.array([[0.0, 0.0, 3.0], [1.0, 2.0, -3.0]]))
+    readings, notes = read(write(*lines), poses=poses, mount=(0.1, 0.2, 0.3), range_min=1.5)
+    assert [r.timestamp for r in readings] == [10.0, 10.5, 11.0]
+    np.testing.assert_allclose(readings[1].pose, [0.5, 1.0, math.pi])
+    assert (readings[0].pose_frame, readings[0].mount, readings[0].range_min) == ("robot", (0.1, 0.2, 0.3), 1.5)
+    assert notes.without_pose == 1
+    readings, _ = read(write(*lines), poses=poses, need_poses=False)
+    assert [r.pose is None for r in readings] == [True, False, False, False]
+    late = Trajectory(np.array([1e3]), np.zeros((1, 3)))
+    assert "none of its 4 scans lies in the time that the given poses cover" in refused(write(*lines), poses=late)

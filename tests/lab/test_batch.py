@@ -47,14 +47,46 @@ def test_eight_devices_give_the_same_numbers(on_one_device, tmp_path):
     assert np.unique(on_one_device["nees"]).size == 50  # each run has its own noise
 
 
-def test_two_hosts_give_the_same_numbers(on_one_device, tmp_path):
+@pytest.fixture
+def address() -> str:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{probe.getsockname()[1]}"
+        return f"127.0.0.1:{probe.getsockname()[1]}"
+
+
+def test_two_hosts_give_the_same_numbers(on_one_device, address, tmp_path):
     output = str(tmp_path / "two.npz")
     finish(*(work(output, "2", address, "2", str(number)) for number in range(2)))
     for name, value in np.load(output).items():
         np.testing.assert_array_equal(value, on_one_device[name])
+
+
+LOST = """
+import os, sys
+import jax, jax.numpy as jnp
+jax.config.update("jax_cpu_collectives_implementation", "gloo")
+jax.distributed.initialize(sys.argv[1], 2, int(sys.argv[2]))
+from linemap_jax.lab.batch import LostProcess, mesh_of_devices, run_chunks
+try:
+    for first, squares in run_chunks(jnp.square, jnp.arange(100.0), mesh=mesh_of_devices(), batch=5):
+        if sys.argv[2] == "1" and first == 20:
+            os._exit(1)
+except LostProcess as error:
+    print(f"{first}: {error}", flush=True)
+    os._exit(0)
+"""
+
+
+def test_a_host_that_is_lost_is_told_of(address):
+    environment = os.environ | {"JAX_PLATFORMS": "cpu", "PYTHONPATH": str(WORKER.parents[2])}
+    stays, goes = [
+        subprocess.Popen([sys.executable, "-c", LOST, address, i], env=environment, stdout=subprocess.PIPE, text=True)
+        for i in "01"
+    ]
+    said, _ = stays.communicate(timeout=120)
+    goes.communicate(timeout=120)
+    assert (stays.returncode, goes.returncode) == (0, 1)
+    assert "20: another process of the run has ended or failed (" in said
 
 
 def square(run: tuple[jax.Array, jax.Array]) -> dict[str, jax.Array]:

@@ -1,8 +1,10 @@
 """What has changed from one map to another."""
 
+import dataclasses
 import math
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -135,9 +137,7 @@ def test_beams_tell_what_has_vanished_from_what_was_not_looked_at() -> None:
     bearings = np.deg2rad(np.arange(-80.0, 80.5, 1.0))
     ranges = np.minimum(5 / np.cos(bearings), 4 / np.maximum(np.abs(np.sin(bearings)), 1e-9))
     scan = Scan.from_ranges(ranges, bearings)
-    scans = Scan(
-        **{name: jnp.asarray(getattr(scan, name))[None] for name in ("ranges", "bearings", "valid", "spacing")}
-    )
+    scans = jax.tree.map(lambda x: x[None], scan)
     poses = Pose(mean=jnp.zeros((1, 3)), cov=jnp.zeros((1, 3, 3)))
     asked = looked_through(changes, [(scans, poses), (scans, poses)], "vanished", chunk=2)
     assert [change.slot_a for change in asked] == [change.slot_a for change in changes]
@@ -159,8 +159,6 @@ def test_beams_tell_what_has_vanished_from_what_was_not_looked_at() -> None:
 
     # A scan of a room in which the near side is still there
     there = np.where(np.abs(np.tan(bearings)) < 0.25, 2 / np.cos(bearings), ranges)
-    scans = Scan(
-        **{**{f: getattr(scans, f) for f in ("bearings", "valid", "spacing")}, "ranges": jnp.asarray(there)[None]}
-    )
+    scans = dataclasses.replace(scans, ranges=jnp.asarray(there)[None])
     asked = looked_through(changes, [(scans, poses)], "vanished", chunk=2)
     assert next(beams(change) for change in asked if change.slot_a == 7 and change.kind == "line") == (0, at_side.sum())

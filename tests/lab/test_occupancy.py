@@ -1,5 +1,6 @@
 """The grid: against a walk along each beam, cell by cell."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -33,6 +34,7 @@ def drive(noise: float = 0.02) -> tuple[Scan, Pose]:
         bearings=jnp.asarray(np.tile(BEARINGS, (3, 1))),
         valid=jnp.asarray(valid),
         spacing=jnp.full(3, BEARINGS[1] - BEARINGS[0]),
+        first=jnp.zeros(3, jnp.int32),
     )
     return scans, Pose(mean=jnp.asarray(POSES), cov=jnp.zeros((3, 3, 3)))
 
@@ -84,16 +86,7 @@ def test_counts_are_those_of_a_walk_along_each_beam() -> None:
 def test_chunks_do_not_matter() -> None:
     scans, poses = drive()
     whole = occupancy(lambda: [(scans, poses)], MOUNT)
-    parts = occupancy(
-        lambda: (
-            (
-                Scan(**{name: getattr(scans, name)[i : i + 1] for name in ("ranges", "bearings", "valid", "spacing")}),
-                Pose(mean=poses.mean[i : i + 1], cov=poses.cov[i : i + 1]),
-            )
-            for i in range(3)
-        ),
-        MOUNT,
-    )
+    parts = occupancy(lambda: (jax.tree.map(lambda x: x[i : i + 1], (scans, poses)) for i in range(3)), MOUNT)  # noqa: B023
     np.testing.assert_array_equal(whole.cells, parts.cells)
     np.testing.assert_array_equal(whole.origin, parts.origin)
 

@@ -353,6 +353,7 @@ def points_of_beams(
         bearings=measurements[:, 1],
         valid=jnp.arange(measurements.shape[0]) < count,
         spacing=jnp.array(0.01),
+        first=jnp.array(0),
     )
     at = Mount(x=mount[0], y=mount[1], theta=mount[2])
     return sensor.points_from_scan(scan, Pose(mean=pose, cov=jnp.zeros((3, 3))), at, jacobians=jacobians)

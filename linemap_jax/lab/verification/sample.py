@@ -63,7 +63,11 @@ def draw(random: np.random.Generator) -> Sample:
 def _through_pipeline(measurements: Float[Array, "N 2"]) -> Sample:
     n = measurements.shape[0]
     scan = Scan(
-        ranges=measurements[:, 0], bearings=measurements[:, 1], valid=jnp.ones(n, bool), spacing=jnp.array(0.01)
+        ranges=measurements[:, 0],
+        bearings=measurements[:, 1],
+        valid=jnp.ones(n, bool),
+        spacing=jnp.array(0.01),
+        first=jnp.array(0),
     )
     pose = Pose(mean=jnp.asarray(POSE), cov=jnp.asarray(COV_POSE))
     sigma = np.sqrt(np.diag(COV_MEASUREMENT))
