@@ -21,7 +21,7 @@ from linemap_jax.io.shapes import LEVEL, Floats, outlines, shapes_of_map, sound
 
 MOST_POINTS = 8_000
 """Raw points on the page."""
-MOST_NUMBERS = 1_200_000
+MOST_NUMBERS = 1_100_000
 """Numbers of all moments together: five bytes each, beside the five megabytes of the program."""
 
 _BAND_STEPS, _CIRCLE_STEPS = 5, 20
@@ -227,9 +227,9 @@ def _trace(places: Floats, name: str, *, customdata: Floats | None = None, **sty
 
 
 def _size(trace: go.Scatter) -> int:
-    """About how many numbers a trace is; a letter is a fifth of one."""
+    """About how many numbers a trace is; a letter, with what protects it in the page, is a third of one."""
     numbers: list[Any] = [trace[name] for name in ("x", "y", "customdata")]
-    return sum(np.size(x) for x in numbers if x is not None) + sum(map(len, trace["text"] or ())) // 5
+    return sum(np.size(x) for x in numbers if x is not None) + sum(map(len, trace["text"] or ())) // 3
 
 
 def _small(numbers: Floats) -> NDArray[np.float32]:
