@@ -11,10 +11,13 @@ import pytest
 
 from linemap_jax import Rules
 from linemap_jax.cli.build import Build, Demo
+from linemap_jax.cli.compare import Compare
 from linemap_jax.cli.evaluate import Evaluate
+from linemap_jax.cli.export import Export
 from linemap_jax.cli.extract import Extract
 from linemap_jax.cli.options import LogInput
 from linemap_jax.cli.simulate import Simulate
+from linemap_jax.io.exports import FORMATS
 
 README = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
 
@@ -38,6 +41,7 @@ def test_the_python_runs_as_a_user_would_run_it(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     said = re.match(r"\[(\S+)\] \[(\S+)\]\n1 \[\[", done.stdout)
+    assert done.stdout.endswith("seen 10 times, at x = 4.0 m\n")
     assert said is not None, done.stdout
     assert [float(number) for number in said.groups()] == pytest.approx([4, 0], abs=0.01)
     assert (tmp_path / "map.json").stat().st_size > 10_000
@@ -72,6 +76,21 @@ def test_the_defaults_of_the_options_are_those_of_the_command(heading, option):
     default = fields[option]
     words = default if isinstance(default, tuple) else (default,)
     assert told.strip("`") == " ".join(f"{word:g}" if isinstance(word, float) else str(word) for word in words)
+
+
+@pytest.mark.parametrize(("command", "command_of"), [(Export, "export"), (Compare, "compare")])
+def test_the_options_of_the_commands_on_maps_are_complete(command, command_of):
+    rows = README.split(f"| option of `{command_of}` |")[1].split("\n\n")[0].splitlines()[2:]
+    told = {re.findall(r"--([a-z-]+)", row)[0].replace("-", "_") for row in rows}
+    of_input = {field.name for field in dataclasses.fields(LogInput)}  # told once
+    assert told == {field.name for field in dataclasses.fields(command)} - {"map", "a", "b"} - of_input
+
+
+def test_the_table_of_formats_is_complete():
+    rows = table_below("To other programs, and back")
+    assert list(rows) == list(FORMATS)
+    for name, (endings, _) in rows.items():
+        assert f"`{FORMATS[name].ending}`" in endings
 
 
 def test_the_table_of_departures_is_complete():

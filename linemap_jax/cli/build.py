@@ -12,10 +12,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from linemap_jax.cli.compilations import cache_folder
+from linemap_jax.cli.history import History
 from linemap_jax.cli.logs import SCANS_EXPLAINED, chunks_of_log, mount_of, opened, progress, tell_poses, warn
 from linemap_jax.cli.options import LogOptions, options_of_update
 from linemap_jax.cli.output import check_output, make_folder, say
 from linemap_jax.cli.rejections import Rejections
+from linemap_jax.cli.resume import START_CAPACITY, differences, map_to_resume
 
 if TYPE_CHECKING:
     from linemap_jax.core.state import LineMap, Report
@@ -23,9 +25,6 @@ if TYPE_CHECKING:
 
 DEMO_NOISE = {"range_sigma": 0.015, "bearing_sigma": 0.0005, "pose_sigma": (0.01, 0.01, 0.002)}
 """What the demo log was made with."""
-
-START_CAPACITY = (1024, 512)
-"""Slots for lines and circles to begin with. To grow costs a compilation, and most buildings fit into these."""
 
 COUNTS = ("added", "fused", "merged", "trimmed", "split", "deleted")
 """The counts of a `Report`."""
@@ -44,20 +43,38 @@ class Build(LogOptions):
     With `unknown` covariances are bounds that hold in any case."""
     json: bool = False
     """Print the summary as JSON."""
+    resume_from: Annotated[Path | None, tyro.conf.arg(metavar="MAP")] = None
+    """Map to go on from, in the frame of the log, as if its log and this one were one drive."""
+    html: bool = False
+    """Write map.html too: a page to explore, with a slider over the map on the way."""
 
     def run(self) -> int:
         """Build the map, and give the exit status."""
-        options = options_of_update(self) | {"pose_error": self.pose_error}
+        options: dict[str, Any] = options_of_update(self) | {"pose_error": self.pose_error}
         from linemap_jax.core.state import Status
         from linemap_jax.io.map_file import write_map
         from linemap_jax.io.plot import plot_map
 
-        map_file, picture = self.output / "map.json", self.output / "map.png"
-        check_output(self.output, map_file, picture, overwrite=self.overwrite)
+        map_file, picture, page = (self.output / f"map.{ending}" for ending in ("json", "png", "html"))
+        check_output(self.output, map_file, picture, *([page] if self.html else []), overwrite=self.overwrite)
+        before = map_to_resume(self.resume_from, self.dtype) if self.resume_from else None
         log = opened(self, self.log)
         options["mount"] = mount_of(self, log, quiet=self.quiet)
+        settings = {
+            "log": self.log.name,
+            "preset": self.preset,
+            "pose_sigma": self.pose_sigma,
+            **{name: option for name, option in options.items() if name != "segmentation"},
+        }
+        if before is not None:
+            if told := differences(before.settings, settings):
+                say(f"warning: {self.resume_from} was built with other settings: {told}", quiet=self.quiet)
+            settings["resumed_from"] = str(before.settings.get("log", self.resume_from))
+        history = History(options["mount"]) if self.html else None
         with progress(log, quiet=self.quiet):
-            line_map, report, positions, seconds, interrupted = _map_of_log(self, log, options)
+            line_map, report, positions, seconds, interrupted = _map_of_log(
+                self, log, options, before.line_map if before else None, history
+            )
         warn(log, quiet=self.quiet)
         lost = sum(bool(status & Status.POSE_NOT_FINITE) for status in report.status.tolist())
         if lost:
@@ -68,21 +85,19 @@ class Build(LogOptions):
 
         if not line_map.lines.valid.any() and not line_map.circles.valid.any():
             say(f"warning: {log.path}: {_rejections(self, log, options)}", quiet=self.quiet)
-
-        settings = {
-            "log": self.log.name,
-            "preset": self.preset,
-            "pose_sigma": self.pose_sigma,
-            **{name: option for name, option in options.items() if name != "segmentation"},
-        }
         make_folder(self.output)
         write_map(map_file, line_map, settings, overwrite=self.overwrite)
         plot_map(picture, line_map, positions, title=self.log.name, overwrite=self.overwrite)
+        if history is not None:
+            from linemap_jax.io.html import Moment, write_html
+
+            moments = [*(Moment(*kept) for kept in history.kept), Moment(line_map, len(positions))]
+            write_html(page, moments, positions, history.points, title=self.log.name, overwrite=self.overwrite)
         if interrupted:
             print(f"linemap: interrupted; the map so far is in {self.output}", file=sys.stderr)
             return 130
-        summary = _summary(self, line_map, report, options, seconds)
-        summary |= {"poses": tell_poses(self, log), "map": str(map_file), "picture": str(picture)}
+        files = {"map": str(map_file), "picture": str(picture)} | ({"page": str(page)} if self.html else {})
+        summary = _summary(self, line_map, report, options, seconds) | {"poses": tell_poses(self, log)} | files
         print(json.dumps(summary, indent=2) if self.json else _in_words(summary))
         return 0
 
@@ -107,7 +122,7 @@ class Demo:
 
 
 def _map_of_log(
-    command: Build, log: "Log", options: dict[str, Any]
+    command: Build, log: "Log", options: dict[str, Any], before: "LineMap | None", history: History | None
 ) -> tuple["LineMap", "Report", list[tuple[float, float]], list[float], bool]:
     """The map, the reports, the positions of the robot, the seconds that each chunk took, reading included.
 
@@ -126,14 +141,21 @@ def _map_of_log(
     def driven() -> Iterator[Any]:
         for chunk in chunks_of_log(command, log, CHUNK):
             positions.extend(map(tuple, np.asarray(chunk.poses.mean)[:, :2].tolist()))
-            yield chunk.scans, chunk.poses
+            if history is None:
+                yield chunk.scans, chunk.poses
+            else:
+                yield from history.pieces(chunk.scans, chunk.poses)
 
     line_map, interrupted = None, False
     started = time.perf_counter()
     try:
-        for grown, report in build_chunks(driven(), map_capacity=start, chunk=CHUNK, run=run, **options):
+        for grown, report in build_chunks(
+            driven(), line_map=before, map_capacity=start, chunk=CHUNK, run=run, **options
+        ):
             line_map = grown
             reports.append(report)
+            if history is not None:
+                history.add(grown)
             seconds.append(time.perf_counter() - started)
             started = time.perf_counter()
     except KeyboardInterrupt:
@@ -202,5 +224,5 @@ def _in_words(summary: dict[str, Any]) -> str:
         f"{summary['seconds_to_first_chunk']:.1f} s to compile, {then}\n"
         f"poses:   {summary['poses']}\n"
         f"map:     {summary['map']}\n"
-        f"picture: {summary['picture']}"
+        f"picture: {summary['picture']}" + (f"\npage:    {summary['page']}" if "page" in summary else "")
     )

@@ -7,10 +7,13 @@ import tyro
 
 from linemap_jax.cli.build import Build, Demo
 from linemap_jax.cli.calibrate import Calibrate
+from linemap_jax.cli.compare import Compare
 from linemap_jax.cli.config import Config
 from linemap_jax.cli.evaluate import Evaluate
+from linemap_jax.cli.export import Export
 from linemap_jax.cli.extract import Extract
 from linemap_jax.cli.info import Info
+from linemap_jax.cli.merge import Merge
 from linemap_jax.cli.options import UsageError
 from linemap_jax.cli.simulate import Simulate
 from linemap_jax.cli.trials import Trials
@@ -21,6 +24,9 @@ Command = (
     | Annotated[Build, tyro.conf.subcommand("build")]
     | Annotated[Extract, tyro.conf.subcommand("extract")]
     | Annotated[Info, tyro.conf.subcommand("info")]
+    | Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[Merge, tyro.conf.subcommand("merge")]
+    | Annotated[Compare, tyro.conf.subcommand("compare")]
     | Annotated[Simulate, tyro.conf.subcommand("simulate")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Trials, tyro.conf.subcommand("trials")]

@@ -249,7 +249,7 @@ def fuse_circles(model: Circles, new: Circles, matches: CircleMatches, rules: Ru
 
     Args:
       model: the circles of the map.
-      new: the circles of a scan.
+      new: the circles of a scan, or of another map.
       matches: which is which. Several new ones that match one of the map are averaged first (of fitted ones, the
         nearest is taken).
       rules: `weigh_circles`.
@@ -264,12 +264,13 @@ def fuse_circles(model: Circles, new: Circles, matches: CircleMatches, rules: Ru
     old = jnp.concatenate([model.center, model.radius[:, None]], -1)
     mean = jax.ops.segment_sum(as_vector, into, k) / n[:, None]
     times = model.times_detected
+    times_new = jnp.maximum(jax.ops.segment_max(new.times_detected, into, k), 1)
     errors = _errors(model)
 
     if not rules.weigh_circles:
         fused, fitted = (old + mean) / 2, model.fitted
     else:
-        weight = 1 / (times + 1).astype(n.dtype)
+        weight = times_new.astype(n.dtype) / (times + times_new).astype(n.dtype)
         running = old + weight[:, None] * (mean - old)
         # The nearest fitted one of those that match
         distance = jnp.where(new.fitted, matches.distance, jnp.inf)
@@ -283,7 +284,7 @@ def fuse_circles(model: Circles, new: Circles, matches: CircleMatches, rules: Ru
         seen = as_vector[which]
 
         both = (has_fit & model.fitted)[:, None, None]
-        errors_seen = dataclasses.replace(_errors(fit), times_detected=jnp.ones_like(times))
+        errors_seen = _errors(fit)
         alike = _at_radius(errors_seen, seen[:, 2], old[:, 2], both)
         gain, joint = combine(_or_neutral(errors, both), _or_neutral(alike, both), pose_error)
 
@@ -302,7 +303,7 @@ def fuse_circles(model: Circles, new: Circles, matches: CircleMatches, rules: Ru
         cov_independent=jnp.where(at, errors.cov_independent, model.cov_independent),
         sqrt_persistent=jnp.where(at, errors.sqrt_persistent, model.sqrt_persistent),
         fitted=jnp.where(touched, fitted, model.fitted),
-        times_detected=times + touched.astype(jnp.int32),
+        times_detected=times + jnp.where(touched, times_new, 0),
     )
 
 

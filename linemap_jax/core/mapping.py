@@ -5,6 +5,7 @@ paper takes them one after the other, which gives nearly the same map and no par
 """
 
 import dataclasses
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -238,7 +239,7 @@ def _update_lines(
     if rules.merge:
         seen_apart = _mark(~pair.collinear, targets, model.valid.shape[0])
         touched = jnp.where(first, targets, -1)
-        model, moved, merged = _merge(model, fused, touched, seen_apart, thresholds, rules, pose_error)
+        model, moved, merged = merge_lines(model, fused, touched, seen_apart, thresholds, rules, pose_error)
         targets = jnp.where(targets >= 0, moved[targets], targets)
         slot, suspect = (jnp.where(x >= 0, moved[x], x) for x in (slot, suspect))
     return _LineUpdate(
@@ -261,7 +262,7 @@ def _mark(which: Bool[Array, "L L"], slots: Int[Array, " L"], capacity: int) -> 
     return jnp.zeros((which.shape[0], capacity), bool).at[:, into].max(which, mode="drop")
 
 
-def _merge(
+def merge_lines(
     model: Lines,
     touched: Lines,
     slots: Int[Array, " L"],
@@ -269,6 +270,7 @@ def _merge(
     thresholds: Thresholds,
     rules: Rules,
     pose_error: PoseError,
+    times: Callable[[Array, Array], Array] = jnp.maximum,
 ) -> tuple[Lines, Int[Array, " K"], Int[Array, ""]]:
     """Join lines of the map that overlap and agree, where this scan touched one of them.
 
@@ -282,6 +284,8 @@ def _merge(
       thresholds: `match_...`.
       rules: which reading of the method.
       pose_error: its model.
+      times: how often a line was detected, from the numbers of its two parts. By default their maximum, since the same
+        scans have seen both.
 
     Returns:
       The lines; for each slot where its line now stands; how many were joined.
@@ -304,7 +308,7 @@ def _merge(
     # Both are estimates of the whole wall: the one that reaches farther knows the end.
     longest = dataclasses.replace(rules, estimate_ends=False)
     joined = fusion.fuse_lines(stays, accepted, goes, jnp.diag(accepted), thresholds, longest, pose_error)
-    joined = dataclasses.replace(joined, times_detected=jnp.maximum(stays.times_detected, goes.times_detected))
+    joined = dataclasses.replace(joined, times_detected=times(stays.times_detected, goes.times_detected))
     low, high = jnp.min(pair, -1), jnp.max(pair, -1)
     model = put(model, jnp.where(accepted, low, -1), joined)
     gone = jnp.where(accepted, high, k)

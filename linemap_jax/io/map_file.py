@@ -4,7 +4,7 @@ A line is given twice: as the paper's view, `rho`, `theta`, `cov` of both, `begi
 `offset`, `angle`, `cov_independent`, `sqrt_persistent`, `first_angle`, `extent`, `var_extent` (the fields of `Lines`),
 which alone is read back; `cov_local` is the covariance of offset and angle. A circle has a `cov`, of (x, y, radius),
 and its two parts, only if it was fitted. Metres, radians, counter-clockwise. Each line and each circle stands on one
-line of the file.
+line of the file. The same content can stand there as GeoJSON, see `linemap_jax.io.geojson`.
 """
 
 import dataclasses
@@ -22,6 +22,7 @@ from linemap_jax.core.lines import rho_theta
 from linemap_jax.core.settings import Capacity
 from linemap_jax.core.state import Circles, LineMap, Lines, SlotsT, empty_circles, empty_lines
 from linemap_jax.io.atomic import OutputError, atomic_write
+from linemap_jax.io.geojson import TYPE, document_from_features, features_from_document
 
 Columns = dict[str, NDArray[Any]]
 """Field -> its values of all lines or circles; the first axis counts them, there are no free slots."""
@@ -57,7 +58,12 @@ class _Fault(ValueError):
 
 
 def write_map(
-    path: str | os.PathLike[str], line_map: LineMap, settings: Mapping[str, Any], *, overwrite: bool = False
+    path: str | os.PathLike[str],
+    line_map: LineMap,
+    settings: Mapping[str, Any],
+    *,
+    geojson: bool = False,
+    overwrite: bool = False,
 ) -> None:
     """Write a map as JSON. What cannot be read back is not written.
 
@@ -66,6 +72,7 @@ def write_map(
       line_map: the map; only its valid slots are written.
       settings: what the map was built with. May hold numbers, strings, lists, arrays, mappings, and dataclasses such
         as `Thresholds`.
+      geojson: whether it is to be GeoJSON.
       overwrite: whether an older file may be replaced.
 
     Raises:
@@ -77,12 +84,14 @@ def write_map(
             "format": FORMAT,
             "version": VERSION,
             "dtype": str(line_map.lines.offset.dtype),
-            "settings": _plain(settings, "settings"),
+            "settings": plain_settings(settings),
             "lines": _entries_of_lines(line_map.lines),
             "circles": _entries_of_circles(line_map.circles),
         }
         _read_lines(document)
         _read_circles(document)
+        if geojson:
+            document = features_from_document(document)
     except _Fault as fault:
         raise MapFileError(f"cannot write {os.fspath(path)}: {fault}") from None
     try:
@@ -98,7 +107,7 @@ def read_map(
     capacity: Capacity | None = None,
     dtype: Literal["float32", "float64"] | None = None,
 ) -> tuple[LineMap, dict[str, Any]]:
-    """Read a map that `write_map` wrote.
+    """Read a map that `write_map` wrote, in either form.
 
     Args:
       path: of the file.
@@ -131,6 +140,23 @@ def read_map(
     return line_map, document["settings"]
 
 
+def columns_of_lines(lines: Lines) -> Columns:
+    """What a map file says of each line, field by field: `rho`, `theta`, `cov` of both, `begin`, `end`, and the rest.
+
+    Args:
+      lines: of a map; free slots are left out.
+    """
+    view = dict(zip(_LINE_VIEW, _view(lines), strict=True))
+    state = {name: getattr(lines, name) for name in _LINE_STATE}
+    return _used({**view, "times_detected": lines.times_detected, **state}, lines.valid)
+
+
+def columns_of_circles(circles: Circles) -> Columns:
+    """What a map file says of each circle, field by field, and `fitted`: only of those that are does `cov` count."""
+    names = (*_CIRCLE, "times_detected", *_FIT_VIEW, *_FIT_STATE, "fitted")
+    return _used({name: getattr(circles, name) for name in names}, circles.valid)
+
+
 @jax.jit  # step by step, each operation would be compiled by itself: a second for the first file
 def _view(lines: Lines) -> tuple[jax.Array, ...]:
     """The fields of `_LINE_VIEW`."""
@@ -138,15 +164,13 @@ def _view(lines: Lines) -> tuple[jax.Array, ...]:
 
 
 def _entries_of_lines(lines: Lines) -> list[dict[str, Any]]:
-    view = dict(zip(_LINE_VIEW, _view(lines), strict=True))
-    state = {name: getattr(lines, name) for name in _LINE_STATE}
-    return _entries({**view, "times_detected": lines.times_detected, **state}, lines.valid)
+    return _entries(columns_of_lines(lines))
 
 
 def _entries_of_circles(circles: Circles) -> list[dict[str, Any]]:
-    names = (*_CIRCLE, "times_detected", *_FIT_VIEW, *_FIT_STATE)
-    entries = _entries({name: getattr(circles, name) for name in names}, circles.valid)
-    fitted = np.asarray(circles.fitted)[np.asarray(circles.valid)]
+    columns = columns_of_circles(circles)
+    fitted = columns.pop("fitted")
+    entries = _entries(columns)
     for entry, has_cov in zip(entries, fitted, strict=True):
         if not has_cov:
             for name in (*_FIT_VIEW, *_FIT_STATE):
@@ -154,10 +178,14 @@ def _entries_of_circles(circles: Circles) -> list[dict[str, Any]]:
     return entries
 
 
-def _entries(columns: dict[str, Any], valid: Any) -> list[dict[str, Any]]:
-    """One mapping for each valid slot."""
+def _used(columns: dict[str, Any], valid: Any) -> Columns:
     keep = np.asarray(valid)
-    plain = [_plain_numbers(np.asarray(column)[keep]) for column in columns.values()]
+    return {name: np.asarray(column)[keep] for name, column in columns.items()}
+
+
+def _entries(columns: Columns) -> list[dict[str, Any]]:
+    """One mapping for each row."""
+    plain = [_plain_numbers(column) for column in columns.values()]
     return [dict(zip(columns, row, strict=True)) for row in zip(*plain, strict=True)]
 
 
@@ -166,6 +194,11 @@ def _plain_numbers(array: NDArray[Any]) -> Any:
     if array.dtype == np.float32:
         array = array.astype(str).astype(np.float64)
     return array.tolist()
+
+
+def plain_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings as a map file holds them: in numbers, strings, lists and mappings alone."""
+    return _plain(settings, "settings")
 
 
 def _plain(value: Any, where: str) -> Any:
@@ -222,6 +255,11 @@ def _load(path: str | os.PathLike[str]) -> dict[str, Any]:
         raise _Fault("is not JSON") from None
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         raise _Fault(f'is not a map: "format" must be "{FORMAT}"')
+    if document.get("type") == TYPE:
+        try:
+            document = document_from_features(document)
+        except ValueError as error:
+            raise _Fault(str(error)) from None
     version = document.get("version")
     if type(version) is not int or version != VERSION:
         raise _Fault(f"has version {json.dumps(version)}; this program reads version {VERSION}")
@@ -229,7 +267,7 @@ def _load(path: str | os.PathLike[str]) -> dict[str, Any]:
         raise _Fault('"dtype" must be "float32" or "float64"')
     if not isinstance(document.get("settings"), dict):
         raise _Fault('"settings" must be an object')
-    document["settings"] = _plain(document["settings"], "settings")
+    document["settings"] = plain_settings(document["settings"])
     return document
 
 
@@ -245,6 +283,8 @@ def _read_lines(document: dict[str, Any]) -> Columns:
     _check_cov(columns["cov_independent"], "lines", "cov_independent")
     _check(columns["extent"][:, 0] <= columns["extent"][:, 1], "lines", "extent", "runs backwards")
     _check(columns["var_extent"].min(1) >= 0, "lines", "var_extent", "is negative")
+    for name, along in zip(("begin", "end"), columns["extent"].T, strict=True):
+        _check_on_line(columns, name, along)
     return {name: columns[name] for name in _LINE_STATE} | _counts(entries, "lines")
 
 
@@ -316,6 +356,17 @@ def _check_cov(
     symmetric = np.abs(correlation - np.swapaxes(correlation, -1, -2)).max((-2, -1), initial=0) <= _ROUNDING
     definite = (variance > 0).all(-1) & (np.linalg.eigvalsh(correlation).min(-1, initial=1) > -slack)
     _check(symmetric & definite | exempt, kind, name, "is not symmetric positive definite")
+
+
+def _check_on_line(columns: Columns, name: str, along: NDArray[Any]) -> None:
+    """Refuse an end point that is not where the state has it: the state alone is read, and somebody has moved it."""
+    anchor, offset, angle = (columns[field].astype(np.float64) for field in ("anchor", "offset", "angle"))
+    normal = np.stack([np.cos(angle), np.sin(angle)], -1)
+    tangent = np.stack([-normal[:, 1], normal[:, 0]], -1)
+    state = anchor + offset[:, None] * normal + along[:, None] * tangent
+    reach = np.abs(anchor).max(-1, initial=0) + np.abs(offset) + np.abs(along)
+    near = np.abs(columns[name] - state).max(-1, initial=0) <= 1e-3 + _ROUNDING * reach
+    _check(near, "lines", name, "is not where anchor, offset, angle and extent have it")
 
 
 def _check(good: NDArray[Any], kind: str, name: str, fault: str) -> None:

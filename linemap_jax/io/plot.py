@@ -7,10 +7,8 @@ Everything is to scale: bands, ellipses and circles are drawn in metres and neve
 
 import math
 import os
-from statistics import NormalDist
 from typing import Any, NamedTuple
 
-import jax
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
@@ -22,12 +20,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator, FuncFormatter, MultipleLocator, NullLocator
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from linemap_jax.core.state import Circles, LineMap, Lines, SlotsT
+from linemap_jax.core.state import Circles, LineMap, Lines
 from linemap_jax.io.atomic import atomic_write
-
-Floats = NDArray[np.float64]
+from linemap_jax.io.shapes import Floats, ellipses, line_bands, outlines, segments, used
 
 DPI = 200
 LARGEST = np.array([9.0, 7.0])
@@ -41,11 +38,6 @@ GRID = "#E6E6E6"
 UNCERTAIN = "#E69F00"  # the orange of Okabe and Ito
 ROBOT = "#8A8A8A"
 BLUES = ListedColormap(mpl.colormaps["Blues"](np.linspace(0.45, 1.0, 256)))
-
-BAND_STEPS = 33
-"""Positions at which the band of a line is evaluated; its edges are hyperbolas."""
-CIRCLE_STEPS = 48
-"""Corners of a drawn circle or ellipse."""
 
 
 def plot_map(
@@ -84,8 +76,8 @@ def draw_map(line_map: LineMap, trajectory: ArrayLike | None = None, *, title: s
         raise ValueError(f"trajectory must be of shape [T, 2], not {path.shape}")
     path = path[np.isfinite(path).all(1)]
 
-    lines, circles = _used(line_map.lines), _used(line_map.circles)
-    ends = _points(lines, lines.extent, np.zeros((1, 1)))
+    lines, circles = used(line_map.lines), used(line_map.circles)
+    ends = segments(lines)
     reach = circles.radius[:, None]
     frame = _frame(np.concatenate([ends.reshape(-1, 2), circles.center - reach, circles.center + reach, path]))
     times = np.concatenate([lines.times_detected, circles.times_detected])
@@ -111,46 +103,6 @@ def draw_map(line_map: LineMap, trajectory: ArrayLike | None = None, *, title: s
     return figure
 
 
-def line_bands(lines: Lines, level: float, steps: int = BAND_STEPS) -> Floats:
-    """The confidence band of each line, as a polygon.
-
-    At the position s along the tangent a small error moves the line by (d offset - s d angle) along its normal, which
-    has the variance C00 - 2 s C01 + s^2 C11. At each position the band holds the true line with probability `level`;
-    over the whole length at once the probability is smaller.
-
-    Args:
-      lines: `K` lines.
-      level: the probability, in (0, 1).
-      steps: positions along each line.
-
-    Returns:
-      Corners in metres, shape `[K, 2 * steps, 2]`: along the line on the side of its normal, and back on the other.
-    """
-    extent, cov = np.asarray(lines.extent, float), np.asarray(lines.cov, float)[..., None]
-    s = np.linspace(extent[:, 0], extent[:, 1], steps, axis=-1)
-    variance = cov[:, 0, 0] - 2 * s * cov[:, 0, 1] + s**2 * cov[:, 1, 1]
-    half = NormalDist().inv_cdf((1 + level) / 2) * np.sqrt(np.maximum(variance, 0))
-    return np.concatenate([_points(lines, s, half), _points(lines, s, -half)[:, ::-1]], 1)
-
-
-def ellipses(center: ArrayLike, cov: ArrayLike, level: float, steps: int = CIRCLE_STEPS) -> Floats:
-    """Confidence ellipses of points in the plane, as polygons.
-
-    Args:
-      center: shape `[K, 2]`, m.
-      cov: shape `[K, 2, 2]`, m^2.
-      level: probability with which the ellipse holds the true point, in (0, 1).
-      steps: corners.
-
-    Returns:
-      Corners in metres, shape `[K, steps, 2]`.
-    """
-    variance, axis = np.linalg.eigh(np.asarray(cov, float))
-    # chi-square with 2 degrees of freedom: P(d^2 < x) = 1 - exp(-x / 2)
-    half = np.sqrt(-2 * math.log1p(-level) * np.maximum(variance, 0))
-    return np.asarray(center, float)[:, None] + np.einsum("kij,kj,sj->ksi", axis, half, _unit_circle(steps))
-
-
 class _Frame(NamedTuple):
     """The part of the plane that is shown."""
 
@@ -158,28 +110,6 @@ class _Frame(NamedTuple):
     high: Floats  # [2], m
     inches: Floats  # [2], its size on paper
     step: float  # m, between the lines of the grid
-
-
-def _used(slots: SlotsT) -> SlotsT:
-    """The lines or circles without free slots and without any that hold NaN or infinity; leaves are NumPy arrays."""
-    keep = np.array(slots.valid)
-    for leaf in jax.tree.leaves(slots):
-        keep &= np.isfinite(np.asarray(leaf)).reshape(keep.size, -1).all(1)
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[keep], slots)
-
-
-def _points(lines: Lines, along: ArrayLike, aside: ArrayLike) -> Floats:
-    """Points at positions along the tangent and aside along the normal, both `[K, S]`. Shape `[K, S, 2]`."""
-    angle = np.asarray(lines.angle, float)[:, None]
-    c, s = np.cos(angle), np.sin(angle)
-    along = np.asarray(along, float)
-    aside = np.asarray(aside, float) + np.asarray(lines.offset, float)[:, None]
-    return np.asarray(lines.anchor, float)[:, None] + np.stack([aside * c - along * s, aside * s + along * c], -1)
-
-
-def _unit_circle(steps: int) -> Floats:
-    turn = np.linspace(0, 2 * np.pi, steps, endpoint=False)
-    return np.stack([np.cos(turn), np.sin(turn)], -1)
 
 
 def _frame(points: Floats) -> _Frame:
@@ -243,10 +173,11 @@ def _draw_lines(axes: Axes, lines: Lines, ends: Floats, colour: ScalarMappable, 
 def _draw_circles(axes: Axes, circles: Circles, colour: ScalarMappable, level: float) -> list[Any]:
     """Circles, and the ellipses of those that have a covariance; returns what the legend shows."""
     center, radius, fitted = (np.asarray(x) for x in (circles.center, circles.radius, circles.fitted))
-    outlines = center[:, None] + radius[:, None, None] * _unit_circle(CIRCLE_STEPS)
     edges = np.asarray(colour.to_rgba(np.asarray(circles.times_detected)))
     faces = edges * np.where(fitted[:, None], [1, 1, 1, 0.35], [1, 1, 1, 0])
-    axes.add_collection(PolyCollection(list(outlines), facecolors=faces, edgecolors=edges, linewidths=0.9, zorder=4))
+    axes.add_collection(
+        PolyCollection(list(outlines(center, radius)), facecolors=faces, edgecolors=edges, linewidths=0.9, zorder=4)
+    )
 
     handles: list[Any] = []
     if not fitted.all():

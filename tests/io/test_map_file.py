@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,54 +12,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import shapely
+from maps import random_map
 
 from linemap_jax.core.settings import Capacity, preset
-from linemap_jax.core.state import Circles, LineMap, Lines, empty_circles, empty_lines
+from linemap_jax.core.state import LineMap, empty_circles, empty_lines
 from linemap_jax.io.map_file import MapFileError, read_map, write_map
 
 SETTINGS: dict[str, Any] = {"preset": "default", "pose_sigma": [0.05, 0.05, 0.0175], "every": 1, "strict": False}
-
-
-def random_cov(rng: np.random.Generator, count: int, sigma: list[float]) -> np.ndarray:
-    root = rng.normal(size=(count, len(sigma), len(sigma))) * np.array(sigma)[:, None]
-    return root @ np.swapaxes(root, -1, -2) + np.diag(np.square(sigma) / 10)
-
-
-def random_map(dtype: str, lines: int = 5, circles: int = 4, free: int = 2) -> LineMap:
-    """A map with free slots in between and, in each, values that must not reach the file."""
-    rng = np.random.default_rng(1)
-    k, c = lines + free, circles + free
-    slot_l, slot_c = rng.permutation(k) < lines, rng.permutation(c) < circles
-    fitted = (np.arange(c) % 2 == 0) & slot_c
-
-    def number(x: np.ndarray) -> jax.Array:
-        return jnp.asarray(x, dtype)
-
-    cov_l, cov_c = random_cov(rng, k, [0.02, 0.005]), random_cov(rng, c, [0.01, 0.01, 0.004])
-    cov_l[~slot_l] = np.nan
-    return LineMap(
-        lines=Lines(
-            anchor=number(rng.uniform(-50, 50, (k, 2))),
-            offset=number(rng.normal(size=k) * 1e-6),
-            angle=number(rng.uniform(-np.pi, np.pi, k)),
-            cov_independent=number(cov_l),
-            sqrt_persistent=number(rng.normal(size=(k, 2, 3)) * [[0.02], [0.005]]),
-            first_angle=number(rng.uniform(-np.pi, np.pi, k)),
-            extent=number(np.sort(rng.uniform(-4, 4, (k, 2)))),
-            var_extent=number(rng.uniform(0, 1e-3, (k, 2))),
-            times_detected=jnp.asarray(rng.integers(1, 40, k), jnp.int32),
-            valid=jnp.asarray(slot_l),
-        ),
-        circles=Circles(
-            center=number(rng.uniform(-50, 50, (c, 2))),
-            radius=number(rng.uniform(0.02, 0.2, c)),
-            cov_independent=number(cov_c * fitted[:, None, None]),
-            sqrt_persistent=number(rng.normal(size=(c, 3, 3)) * [[0.02], [0.02], [0.0]] * fitted[:, None, None]),
-            fitted=jnp.asarray(fitted),
-            times_detected=jnp.asarray(rng.integers(1, 40, c), jnp.int32),
-            valid=jnp.asarray(slot_c),
-        ),
-    )
 
 
 def assert_same_content(slots: Any, others: Any) -> None:
@@ -92,6 +53,62 @@ def test_round_trip_is_lossless(tmp_path: Path, dtype: str) -> None:
     # and the file of what was read is the file
     write_map(tmp_path / "again.json", again, settings)
     assert (tmp_path / "again.json").read_bytes() == (tmp_path / "map.json").read_bytes()
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_geojson_is_lossless_too(tmp_path: Path, dtype: str) -> None:
+    line_map = random_map(dtype)
+    write_map(tmp_path / "map.geojson", line_map, SETTINGS, geojson=True)
+    again, settings = read_map(tmp_path / "map.geojson")
+    assert settings == SETTINGS
+    assert_same_content(line_map.lines, again.lines)
+    assert_same_content(line_map.circles, again.circles)
+    # both forms of what was read are the same files again
+    for name, geojson in (("map.json", False), ("again.geojson", True)):
+        write_map(tmp_path / name, again, settings, geojson=geojson)
+    assert (tmp_path / "again.geojson").read_bytes() == (tmp_path / "map.geojson").read_bytes()
+    write_map(tmp_path / "direct.json", line_map, SETTINGS)
+    assert (tmp_path / "map.json").read_bytes() == (tmp_path / "direct.json").read_bytes()
+
+
+def test_geojson_as_other_programs_see_it(tmp_path: Path) -> None:
+    line_map = random_map("float32")
+    write_map(tmp_path / "map.geojson", line_map, {}, geojson=True)
+    features = json.loads((tmp_path / "map.geojson").read_text())["features"]
+    shapes = [shapely.geometry.shape(feature["geometry"]) for feature in features]
+    assert [shape.geom_type for shape in shapes] == ["LineString"] * 5 + ["Point"] * 4
+    lengths = np.asarray(line_map.lines.length)[np.asarray(line_map.lines.valid)]
+    np.testing.assert_allclose([shape.length for shape in shapes[:5]], lengths, atol=1e-4)
+    centers = np.asarray(line_map.circles.center)[np.asarray(line_map.circles.valid)]
+    np.testing.assert_allclose([shape.coords[0] for shape in shapes[5:]], centers, atol=1e-5)
+    assert {feature["properties"]["kind"] for feature in features[:5]} == {"line"}
+    assert {"rho", "theta", "cov", "times_detected"} <= features[0]["properties"].keys()
+
+
+def test_geojson_that_somebody_has_edited(tmp_path: Path) -> None:
+    write_map(tmp_path / "map.geojson", random_map("float32"), {}, geojson=True)
+    document = json.loads((tmp_path / "map.geojson").read_text())
+
+    def read(change: Callable[[Any], None]) -> None:
+        edited = copy.deepcopy(document)
+        change(edited)
+        (tmp_path / "edited.geojson").write_text(json.dumps(edited))
+        read_map(tmp_path / "edited.geojson")
+
+    read(lambda d: [place.append(0.0) for place in d["features"][0]["geometry"]["coordinates"]])  # a height
+    for change, cause in (
+        (_set("features", 1, "geometry", "coordinates", 0, 0, 3.0), "lines[1].begin is not where anchor, offset,"),
+        (_set("features", 1, "geometry", "coordinates", []), "features[1], a line, must have two positions"),
+        (_set("features", 5, "geometry", "type", "Polygon"), "features[5], a circle, must be a Point"),
+        (_set("features", 0, "properties", "kind", "tree"), 'must have the kind "line" or "circle", not "tree"'),
+        (_drop("features", 0, "properties"), "features[0] must have properties and a geometry"),
+        (_drop("features", 0, "properties", "angle"), 'lines[0] has no "angle"'),
+        (_drop("features"), '"features" must be a list'),
+        (_set("format", "linemap-world"), "is not a map"),
+    ):
+        with pytest.raises(MapFileError, match=re.escape(cause)):
+            read(change)
 
 
 def test_float32_has_short_decimals_that_are_exact(tmp_path: Path) -> None:

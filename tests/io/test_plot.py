@@ -15,7 +15,8 @@ from matplotlib.figure import Figure
 
 from linemap_jax.core.state import Circles, LineMap, Lines, empty_circles, empty_lines
 from linemap_jax.io.atomic import OutputError
-from linemap_jax.io.plot import draw_map, ellipses, line_bands, plot_map
+from linemap_jax.io.plot import draw_map, plot_map
+from linemap_jax.io.shapes import ellipses, line_bands
 
 
 def number(x: object) -> jnp.ndarray:

@@ -1,0 +1,131 @@
+"""`linemap compare`: what has moved, vanished or appeared from one map to another."""
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from linemap_jax.cli.logs import mount_of, opened, plain_chunks, progress, warn
+from linemap_jax.cli.merge import read_two_maps
+from linemap_jax.cli.options import LogInput, UsageError, check_input
+
+if TYPE_CHECKING:
+    from linemap_jax.lab.comparison import Change, Comparison, What
+
+MOST_TOLD = 15
+"""Changes of a kind that are told in words; --json tells all."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Compare(LogInput):
+    """Compare two maps that are in one frame: what has moved, vanished or appeared, and how sure that is."""
+
+    a: tyro.conf.Positional[Path]
+    """The map before: map.json of `build`, or its GeoJSON."""
+    b: tyro.conf.Positional[Path]
+    """The map after, of another drive."""
+    log_a: Annotated[Path | None, tyro.conf.arg(metavar="LOG")] = None
+    """Log of the map before: whether its beams went through where something has appeared."""
+    log_b: Annotated[Path | None, tyro.conf.arg(metavar="LOG")] = None
+    """Log of the map after: whether its beams went through where something has vanished, or did not look there."""
+    within: Annotated[float, tyro.conf.arg(metavar="M")] = 0.5
+    """How far a thing may have moved, m; farther away it is another one."""
+    alpha: Annotated[float, tyro.conf.arg(metavar="P")] = 0.01
+    """Probability of telling of any movement where there is none."""
+    shortest: Annotated[float, tyro.conf.arg(metavar="M")] = 0.5
+    """Shortest piece of a line that is told to have vanished or appeared, m."""
+    at_least: Annotated[int, tyro.conf.arg(metavar="N")] = 3
+    """Lines and circles that were detected more seldom are passed over."""
+    quiet: bool = False
+    """No progress, no warnings."""
+    json: bool = False
+    """Print the changes as JSON."""
+
+    def run(self) -> int:
+        """Compare them, and give the exit status."""
+        for name in ("within", "shortest"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise UsageError(f"--{name} must be positive, not {getattr(self, name)}")
+        if not 0 < self.alpha < 1:
+            raise UsageError(f"--alpha must be between 0 and 1, not {self.alpha}")
+        if self.at_least < 1:
+            raise UsageError(f"--at-least must be 1 or more, not {self.at_least}")
+        check_input(self)
+        a, b, _ = read_two_maps(self.a, self.b)
+        from linemap_jax.build import CHUNK
+        from linemap_jax.lab.comparison import compare_maps, looked_through
+
+        options = {"within": self.within, "alpha": self.alpha, "shortest": self.shortest, "at_least": self.at_least}
+        found = compare_maps(a, b, **options)
+        logs: list[tuple[What, Path | None]] = [("appeared", self.log_a), ("vanished", self.log_b)]
+        for what, path in logs:
+            if path is not None:
+                log = opened(self, path)
+                mount = mount_of(self, log, quiet=self.quiet)
+                with progress(log, quiet=self.quiet):
+                    changes = looked_through(found.changes, plain_chunks(log), what, mount, chunk=CHUNK)
+                found = found._replace(changes=changes)
+                warn(log, quiet=self.quiet)
+        print(json.dumps(_summary(self, found), indent=2) if self.json else _in_words(found))
+        return 0
+
+
+def _summary(command: Compare, found: "Comparison") -> dict[str, Any]:
+    said: dict[str, Any] = {
+        "a": str(command.a),
+        "b": str(command.b),
+        "alpha": command.alpha,
+        "pairs": found.pairs,
+        "same_lines": found.same_lines,
+        "same_circles": found.same_circles,
+    }
+    for what in ("moved", "vanished", "appeared"):
+        said[what] = [_entry(change) for change in found.changes if change.what == what]
+    return said
+
+
+def _entry(change: "Change") -> dict[str, Any]:
+    """What there is to say of a change, units in the names."""
+    named = {"sigma": "sigma_m", "turn": "turn_rad", "shift": "shift_m", "p": "p_holm", "radius": "radius_m"}
+    fields = {name: value for name, value in dataclasses.asdict(change).items() if name != "what" and value is not None}
+    return {named.get(name, name): value for name, value in fields.items()}
+
+
+def _in_words(found: "Comparison") -> str:
+    said = [f"{found.same_lines} lines and {found.same_circles} circles are where they were"]
+    for what in ("moved", "vanished", "appeared"):
+        changes = [change for change in found.changes if change.what == what]
+        sure = [change for change in changes if _borne_out(change)]
+        lines = sum(change.kind == "line" for change in sure)
+        said.append(f"{what}: {lines} lines or pieces of lines, {len(sure) - lines} circles")
+        said += [f"  {_told(change)}" for change in sure[:MOST_TOLD]]
+        if len(sure) > MOST_TOLD:
+            said.append(f"  ... and {len(sure) - MOST_TOLD} more")
+        if len(changes) > len(sure):
+            said.append(
+                f"  {len(changes) - len(sure)} more are in one map only, but the other drive did not see through"
+            )
+    return "\n".join(said)
+
+
+def _borne_out(change: "Change") -> bool:
+    """Where a log of the other drive was asked, most of its beams went through."""
+    return change.passed is None or change.met is None or change.passed > change.met
+
+
+def _told(change: "Change") -> str:
+    (x, y), (u, v) = change.begin, change.end
+    if change.kind == "line":
+        what = f"line of {math.dist(change.begin, change.end):.2f} m from ({x:.2f}, {y:.2f}) to ({u:.2f}, {v:.2f})"
+    else:
+        what = f"circle of {change.radius:.2f} m at ({x:.2f}, {y:.2f})"
+    if change.shift is not None and change.sigma is not None:
+        turn = "" if change.turn is None else f", turned {math.degrees(change.turn):.1f} degrees"
+        return f"{what}: by {math.hypot(*change.shift):.2f} ± {change.sigma:.2f} m{turn} (p = {change.p:.1g})"
+    what += f", detected {change.times_detected} times"
+    if change.passed is None or change.met is None:
+        return what
+    return f"{what}; {change.passed} of {change.passed + change.met} beams of the other drive went through"

@@ -1,0 +1,99 @@
+"""`linemap export`: a map in the formats of other programs."""
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from linemap_jax.cli.compilations import keep_compilations
+from linemap_jax.cli.logs import mount_of, opened, progress, warn
+from linemap_jax.cli.options import LogInput, UsageError, check_input
+from linemap_jax.cli.output import say
+
+if TYPE_CHECKING:
+    from linemap_jax.io.log import Log
+
+FormatName = Literal["json", "geojson", "svg", "dxf", "nav2", "mcap", "tum", "png", "html"]
+"""What `--to` offers: the names of `linemap_jax.io.exports.FORMATS`, which is not loaded to print a help text."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Export(LogInput):
+    """Write a map in another format: for GIS, CAD, ROS 2, nav2, a browser."""
+
+    map: tyro.conf.Positional[Path]
+    """map.json of `build`, or its GeoJSON."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE")]
+    """File to write. `nav2` writes the picture, .pgm, beside its .yaml."""
+    to: Annotated[FormatName | None, tyro.conf.arg(metavar="FORMAT")] = None
+    """json, geojson, svg, dxf, nav2 (.yaml), mcap, tum, png or html. That of the file's ending unless given."""
+    log: Annotated[Path | None, tyro.conf.arg(metavar="LOG")] = None
+    """CARMEN log or ROS bag, in the frame of the map: `nav2` makes its grid of the scans, `tum` writes the poses,
+    pictures show the path."""
+    resolution: Annotated[float, tyro.conf.arg(metavar="M")] = 0.05
+    """Side of a cell of `nav2`, m."""
+    overwrite: bool = False
+    """Replace output that is there already."""
+    quiet: bool = False
+    """No progress, no warnings."""
+
+    def run(self) -> int:
+        """Write it, and give the exit status."""
+        from linemap_jax.io.exports import FORMATS, LOG_NEEDED, Content, format_of
+
+        name = self.to or format_of(self.output)
+        if name is None:
+            endings = ", ".join(format.ending for format in FORMATS.values())
+            raise UsageError(f"{self.output}: its ending tells no format; give --to, or one of {endings}")
+        if self.log is None and name in LOG_NEEDED:
+            raise UsageError(f"{name} is made from the scans of a log; give --log")
+        if not 0 < self.resolution < float("inf"):
+            raise UsageError(f"--resolution must be positive, not {self.resolution}")
+        check_input(self)
+        import jax
+
+        jax.config.update("jax_enable_x64", True)
+        keep_compilations()
+        from linemap_jax.io.map_file import read_map
+
+        line_map, settings = read_map(self.map)
+        added: dict[str, Any] = {}
+        if self.log is not None and name not in ("json", "geojson"):
+            log = opened(self, self.log)
+            with progress(log, quiet=self.quiet):
+                added = _read(self, log, name)
+            warn(log, quiet=self.quiet)
+        title = str(settings.get("log", self.map.name))
+        content = Content(line_map=line_map, settings=settings, title=title, **added)
+        FORMATS[name].write(self.output, content, self.overwrite)
+        say(f"{self.map} -> {self.output} ({name})", quiet=self.quiet)
+        return 0
+
+
+def _read(command: Export, log: "Log", name: str) -> dict[str, Any]:
+    """What a format wants of a log, by the fields of `Content`."""
+    import numpy as np
+
+    from linemap_jax.build import CHUNK
+    from linemap_jax.cli.logs import plain_chunks
+    from linemap_jax.io.html import MOST_POINTS
+    from linemap_jax.io.scans import chunks_of_readings
+    from linemap_jax.io.thinned import Thinned
+    from linemap_jax.lab.occupancy import occupancy, returns_in_world
+
+    mount = mount_of(command, log, quiet=command.quiet)
+    if name == "nav2":
+        try:
+            return {"grid": occupancy(lambda: plain_chunks(log), mount, resolution=command.resolution)}
+        except ValueError as error:
+            raise UsageError(f"{log.path}: {error}") from error
+    timestamps, poses, points = [], [], Thinned(2 * MOST_POINTS)
+    for chunk in chunks_of_readings(log, CHUNK, cov_pose=np.zeros((3, 3)), dtype="float64"):
+        timestamps.append(chunk.timestamps)
+        poses.append(np.asarray(chunk.poses.mean))
+        if name == "html":
+            _, places, valid = returns_in_world(chunk.scans, chunk.poses, mount)
+            points.extend(places[valid])
+    found: dict[str, Any] = {"timestamps": np.concatenate(timestamps), "poses": np.concatenate(poses)}
+    return found | ({"points": np.array(points.kept).reshape(-1, 2)} if name == "html" else {})

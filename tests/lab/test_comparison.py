@@ -1,0 +1,164 @@
+"""What has changed from one map to another."""
+
+import dataclasses
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from maps import lines_between, poles_at
+from scipy import stats
+
+from linemap_jax.core.state import LineMap, Pose, Scan
+from linemap_jax.lab.comparison import Change, Comparison, compare_maps, holm, looked_through
+
+SIGMA = 0.01, 0.003
+ROOM = [(-5, -4), (5, -4), (5, 4), (-5, 4)]
+
+
+def outline(corners: Any) -> np.ndarray:
+    corners = np.asarray(corners, float)
+    return np.stack([corners, np.roll(corners, -1, 0)], 1)
+
+
+def box(x: float, y: float, size: float = 1.0) -> np.ndarray:
+    return outline([(x, y), (x + size, y), (x + size, y + size), (x, y + size)])
+
+
+def seen(*parts: np.ndarray, seed: int = 0, poles: Any = (), times: int = 10) -> LineMap:
+    """A map of walls, each line with an error that its covariance tells of."""
+    ends = np.concatenate([outline(ROOM), *parts])
+    rng = np.random.default_rng(seed)
+    step = ends[:, 1] - ends[:, 0]
+    half = np.linalg.norm(step, axis=-1, keepdims=True) / 2
+    tangent = step / (2 * half)
+    normal = np.stack([tangent[:, 1], -tangent[:, 0]], -1)
+    offset, turn = (rng.normal(0, sigma, (len(ends), 1)) for sigma in SIGMA)
+    ends = ends + np.stack([offset * normal - turn * half * normal, offset * normal + turn * half * normal], 1)
+    ends = ends[:, ::-1] if seed % 2 else ends  # the other way round
+    centers = np.reshape(poles, (-1, 3)) + rng.normal(0, 0.01, (len(poles), 1)) * [1, 1, 0]
+    circles = poles_at(centers)
+    return LineMap(lines=lines_between(ends, sigma=SIGMA, times=times, room=32), circles=circles)
+
+
+def told(found: Comparison, what: str, kind: str = "line") -> list[Change]:
+    return [change for change in found.changes if (change.what, change.kind) == (what, kind)]
+
+
+def test_one_box_moved_and_one_vanished() -> None:
+    poles = [(4, 3, 0.15), (-4, 3, 0.15), (-4, -3, 0.15)]
+    before = seen(box(-2, 0), box(1, 0), poles=poles, seed=0)
+    after = seen(box(-1.7, 0), poles=[poles[0], (-4, 3.2, 0.15)], seed=1)
+    found = compare_maps(before, after)
+
+    moved = told(found, "moved")
+    assert len(moved) == 4
+    for change in moved:
+        assert change.shift == pytest.approx((0.3, 0.0), abs=0.05)
+        assert change.p is not None
+        assert change.p < 1e-6
+        assert change.sigma == pytest.approx(math.sqrt(2) * SIGMA[0], rel=0.1)
+        assert change.slot_a in range(4, 8)
+    # two of them across their direction, two along it
+    assert sum(abs(change.begin[0] - change.end[0]) < 0.1 for change in moved) == 2
+    gone = told(found, "vanished")
+    assert {change.slot_a for change in gone} == {8, 9, 10, 11}
+    assert all(math.dist(change.begin, change.end) == pytest.approx(1, abs=0.01) for change in gone)
+    assert told(found, "appeared") == []
+    assert found.same_lines == 4
+    (pole,) = told(found, "moved", "circle")
+    assert pole.shift == pytest.approx((0, 0.2), abs=0.05)
+    (pole,) = told(found, "vanished", "circle")
+    assert pole.begin == pytest.approx((-4, -3), abs=0.05)
+    assert found.same_circles == 1
+
+    back = compare_maps(after, before)
+    assert [len(told(back, what)) for what in ("moved", "vanished", "appeared")] == [4, 0, 4]
+    assert all(change.shift == pytest.approx((-0.3, 0.0), abs=0.05) for change in told(back, "moved"))
+
+
+def test_a_door_that_was_opened_and_a_line_that_was_seen_farther() -> None:
+    def wall(*spans: tuple[float, float]) -> np.ndarray:
+        return np.array([[(low, 1.0), (high, 1.0)] for low, high in spans])
+
+    found = compare_maps(seen(wall((-4, 4))), seen(wall((-4, -1), (0, 4)), seed=1))
+    (gap,) = told(found, "vanished")
+    assert sorted((gap.begin[0], gap.end[0])) == pytest.approx([-1, 0], abs=0.01)
+    assert len(found.changes) == 1
+
+    found = compare_maps(seen(wall((-4, 0))), seen(wall((-4, 3)), seed=1))
+    (more,) = found.changes
+    assert (more.what, sorted((more.begin[0], more.end[0]))) == ("appeared", pytest.approx([0, 3], abs=0.01))
+
+
+def test_where_nothing_has_changed_hardly_anything_is_told() -> None:
+    """Eighty pairs of maps of one room: some movement is told of in one per cent of them."""
+    alarms = 0
+    for seed in range(0, 160, 2):
+        found = compare_maps(seen(box(0, 0), seed=seed), seen(box(0, 0), seed=seed + 1), alpha=0.01)
+        alarms += bool(found.changes)
+        assert found.pairs == 8
+    assert alarms <= stats.binom.isf(1e-3, 80, 0.01)  # 0.8 are expected
+
+
+def test_p_values_are_uniform_where_nothing_has_changed() -> None:
+    """Each alone, by way of a family of one."""
+    rng = np.random.default_rng(5)
+    p = []
+    for _ in range(60):
+        offset, turn = rng.normal(0, SIGMA)
+        lines = lines_between([[(-1, offset - turn), (1, offset + turn)]], sigma=SIGMA, room=32)
+        exact = lines_between([[(-1, 0), (1, 0)]], sigma=(1e-6, 1e-6), room=32)
+        maps = [LineMap(lines=x, circles=poles_at([])) for x in (lines, exact)]
+        found = compare_maps(*maps, alpha=1 - 1e-12)
+        p += [change.p for change in found.changes if change.what == "moved"]
+    assert len(p) == 60
+    assert stats.kstest(p, "uniform").pvalue > 1e-3
+
+
+def test_what_was_seen_once_is_passed_over() -> None:
+    before, after = seen(box(0, 0), times=2), seen(seed=1)
+    assert len(told(compare_maps(before, after), "vanished")) == 4
+    assert compare_maps(before, after, at_least=3).changes == []
+
+
+def test_holm() -> None:
+    """By hand: 4 x 0.005, 3 x 0.01, 2 x 0.03, 0.04 raised to what stands before it."""
+    np.testing.assert_allclose(holm(np.array([0.03, 0.005, 0.04, 0.01])), [0.06, 0.02, 0.06, 0.03])
+    assert holm(np.zeros(0)).size == 0
+
+
+def test_beams_tell_what_has_vanished_from_what_was_not_looked_at() -> None:
+    """The scanner looks along x from the origin: through one box, not towards the other."""
+    before, after = seen(box(2, -0.5), box(-3, -0.5), poles=[(1, 0, 0.1)]), seen(seed=1)
+    changes = compare_maps(before, after).changes
+    bearings = np.deg2rad(np.arange(-80.0, 80.5, 1.0))
+    ranges = np.minimum(5 / np.cos(bearings), 4 / np.maximum(np.abs(np.sin(bearings)), 1e-9))
+    scan = Scan.from_ranges(ranges, bearings)
+    scans = jax.tree.map(lambda x: x[None], scan)
+    poses = Pose(mean=jnp.zeros((1, 3)), cov=jnp.zeros((1, 3, 3)))
+    asked = looked_through(changes, [(scans, poses), (scans, poses)], "vanished", chunk=2)
+    assert [change.slot_a for change in asked] == [change.slot_a for change in changes]
+
+    def beams(change: Change) -> tuple[int | None, int | None]:
+        return change.passed, change.met
+
+    (pole,) = told(Comparison(asked, 0, 0, 0), "vanished", "circle")
+    at_pole = np.abs(bearings - math.atan2(*pole.begin[::-1])) < math.asin(0.1 / math.hypot(*pole.begin))
+    assert beams(pole) == (2 * at_pole.sum(), 0)
+    assert at_pole.sum() in (11, 12)  # 10 cm at 1 m are 11.5 degrees, in both scans
+    by_slot = {change.slot_a: beams(change) for change in asked if change.kind == "line"}
+    (near_side,) = (change for change in asked if change.slot_a == 7)  # at x = 2, from y = -0.5 to 0.5, behind the pole
+    low, high = sorted(math.atan2(y, x) for x, y in (near_side.begin, near_side.end))
+    at_side = (low < bearings) & (bearings < high) & ~at_pole
+    assert by_slot[7] == (2 * at_side.sum(), 0)
+    assert at_side.sum() in range(15, 20)
+    assert [by_slot[slot] for slot in (8, 9, 10, 11)] == [(0, 0)] * 4
+
+    # A scan of a room in which the near side is still there
+    there = np.where(np.abs(np.tan(bearings)) < 0.25, 2 / np.cos(bearings), ranges)
+    scans = dataclasses.replace(scans, ranges=jnp.asarray(there)[None])
+    asked = looked_through(changes, [(scans, poses)], "vanished", chunk=2)
+    assert next(beams(change) for change in asked if change.slot_a == 7 and change.kind == "line") == (0, at_side.sum())

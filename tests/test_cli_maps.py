@@ -1,0 +1,233 @@
+"""`linemap export`, `merge`, `compare`, and `build` that goes on from a map or draws a page: maps in and out."""
+
+import json
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from PIL import Image
+
+from linemap_jax.cli import main
+from linemap_jax.cli.resume import differences
+from linemap_jax.core.settings import PAPER_RULES, Rules, SensorNoise
+from linemap_jax.io.exports import FORMATS
+
+BEAMS, SCANS = 181, 12  # so many beams as in test_cli.py: another number would be compiled anew
+BEARINGS = np.deg2rad(np.arange(BEAMS) - 90.0)
+BOX = np.array([(1.0, -1.0), (2.0, -1.0), (2.0, 0.0), (1.0, 0.0)])
+ROOM = np.array([(-3.0, -3.0), (4.0, -3.0), (4.0, 3.0), (-3.0, 3.0)])
+JAX_SETTINGS = "jax_enable_x64", "jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _as_it_was(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """The command line sets up jax for its process; and its cache of compilations is not the user's."""
+    before = {name: getattr(jax.config, name) for name in JAX_SETTINGS}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "cache"))
+        yield
+    for name, value in before.items():
+        jax.config.update(name, value)
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+    """Runs the command line in this process; gives the exit status, and what stands on stdout and stderr."""
+
+    def run(*args: Any) -> tuple[int, str, str]:
+        capsys.readouterr()
+        return main([str(arg) for arg in args]), *capsys.readouterr()
+
+    return run
+
+
+@pytest.fixture
+def refuse(run: Callable[..., tuple[int, str, str]], tmp_path: Path) -> Callable[..., str]:
+    """Runs what must be refused; gives the one sentence, once nothing is found to be left behind."""
+
+    def refuse(*args: Any) -> str:
+        before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+        status, out, err = run(*args)
+        assert (status, out) == (2, "")
+        assert re.fullmatch(r"linemap: [^\n]+\n", err), err
+        assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+        return err.removeprefix("linemap: ").rstrip("\n")
+
+    return refuse
+
+
+def log_of(path: Path, box: np.ndarray, seed: int, scans: range = range(SCANS)) -> Path:
+    """A drive along a wall of the room, looking at the box from one side and then the other."""
+    corners = [ROOM, box]
+    begin = np.concatenate(corners)
+    end = np.concatenate([np.roll(part, -1, 0) for part in corners])
+    rows = []
+    for i in scans:
+        rng = np.random.default_rng([seed, i])
+        x, y, theta = (-1.0 + 0.1 * i, -2.0, 0.4) if i % 2 else (0.5 + 0.1 * i, 1.5, -1.0)
+        way = np.stack([np.cos(theta + BEARINGS), np.sin(theta + BEARINGS)], -1)[:, None]
+        step, edge = begin - (x, y), end - begin
+        cross = way[..., 0] * edge[:, 1] - way[..., 1] * edge[:, 0]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            far = (step[:, 0] * edge[:, 1] - step[:, 1] * edge[:, 0]) / cross
+            along = (step[:, 0] * way[..., 1] - step[:, 1] * way[..., 0]) / cross
+        ranges = np.where((far > 0) & (along >= 0) & (along <= 1), far, np.inf).min(1) + rng.normal(0, 0.01, BEAMS)
+        pose = f"{x:.4f} {y:.4f} {theta:.4f}"
+        rows.append(f"FLASER {BEAMS} {' '.join(f'{r:.3f}' for r in ranges)} {pose} {pose} {100 + i} robot 0.5\n")
+    path.write_text("".join(rows))
+    return path
+
+
+OPTIONS = "--range-sigma", "0.01", "--pose-sigma", "0.005", "0.005", "0.002"
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with two drives and their maps: `a` with a page, and `b`, when the box stood 30 cm farther."""
+    folder = tmp_path_factory.mktemp("maps")
+    for name, box, seed, more in (("a", BOX, 0, ["--html"]), ("b", BOX + (0.3, 0), 1, [])):
+        log = log_of(folder / f"{name}.log", box, seed)
+        assert main(["build", str(log), "-o", str(folder / name), *OPTIONS, "--quiet", *more]) == 0
+    return folder
+
+
+def document(path: Path) -> dict[str, Any]:
+    return json.loads(path.read_text())
+
+
+def test_build_draws_a_page_with_the_map_on_the_way(built: Path) -> None:
+    assert sorted(path.name for path in (built / "a").iterdir()) == ["map.html", "map.json", "map.png"]
+    assert [path.name for path in (built / "b").iterdir() if path.suffix == ".html"] == []
+    page = (built / "a/map.html").read_text()
+    assert re.findall(r'"label":"(\d+)"', page) == ["8", "12"]
+    assert page.count('"name":"raw points"') == 1
+
+
+def test_resumed_it_is_the_map_of_one_drive(built: Path, run: Any, tmp_path: Path) -> None:
+    first, second = (
+        log_of(tmp_path / f"{name}.log", BOX, 0, part) for name, part in (("one", range(6)), ("two", range(6, SCANS)))
+    )
+    assert run("build", first, "-o", tmp_path / "one", *OPTIONS)[0] == 0
+    status, _, err = run("build", second, "-o", tmp_path / "two", *OPTIONS, "--resume-from", tmp_path / "one/map.json")
+    assert (status, err) == (0, "")
+    whole, resumed = document(built / "a/map.json"), document(tmp_path / "two/map.json")
+    for kind in ("lines", "circles"):  # the slots may differ
+        assert sorted(map(json.dumps, resumed[kind])) == sorted(map(json.dumps, whole[kind]))
+    assert resumed["settings"]["resumed_from"] == "one.log"
+
+
+def test_other_settings_are_told() -> None:
+    noise = SensorNoise(range_sigma=0.01)
+    before = {"preset": "paper", "noise": noise, "pose_sigma": [0.05, 0.05, 0.01], "rules": Rules(merge=False)}
+    now = {"preset": "default", "noise": SensorNoise(), "pose_sigma": (0.05, 0.05, 0.01), "rules": Rules()}
+    told = "preset paper (now default), noise.range_sigma 0.01 (now 0.02), rules.merge False (now True)"
+    assert differences(before, now) == told
+    assert differences(now, now) == ""
+    assert differences({"merged": []}, now) == ""
+    assert differences(before | {"rules": PAPER_RULES}, now).endswith(
+        "rules.maximum_likelihood False (now True) and 9 more"
+    )
+
+
+def test_every_format_by_its_ending(built: Path, run: Any, tmp_path: Path) -> None:
+    for name, format in FORMATS.items():
+        path = tmp_path / f"map{format.ending}"
+        status, out, err = run("export", built / "a/map.json", "-o", path, "--log", built / "a.log")
+        assert (status, out, err) == (0, "", f"linemap: {built / 'a/map.json'} -> {path} ({name})\n")
+        assert path.stat().st_size > 100
+    # GeoJSON is a map to all commands, and the way back loses nothing
+    assert run("export", tmp_path / "map.geojson", "--to", "json", "-o", tmp_path / "back", "--quiet") == (0, "", "")
+    assert (tmp_path / "back").read_bytes() == (built / "a/map.json").read_bytes()
+    grid = np.asarray(Image.open(tmp_path / "map.pgm"))
+    assert set(np.unique(grid)) == {0, 205, 254}
+    # the room is larger than the part of it that is drawn black
+    assert (grid == 254).sum() * 0.05**2 == pytest.approx(7 * 6 - 1, rel=0.2)
+    stamps = np.loadtxt(tmp_path / "map.tum")[:, 0]
+    assert stamps.tolist() == [100 + i for i in range(SCANS)]
+
+
+def test_maps_are_merged(built: Path, run: Any, tmp_path: Path) -> None:
+    status, out, err = run("merge", built / "a/map.json", built / "b/map.json", "-o", tmp_path / "ab", "--json")
+    assert (status, err) == (0, "")
+    summary, merged = json.loads(out), document(tmp_path / "ab/map.json")
+    assert (
+        summary["lines"]
+        == len(merged["lines"])
+        == summary["a"]["lines"] + summary["b"]["lines"] - summary["lines_joined"]
+    )
+    assert summary["lines_joined"] >= 4
+    assert [each["log"] for each in merged["settings"]["merged"]] == ["a.log", "b.log"]
+    east = [line for line in merged["lines"] if line["rho"] == pytest.approx(4, abs=0.05) and abs(line["theta"]) < 0.05]
+    assert [line["times_detected"] for line in east] == [2 * SCANS]
+    assert (tmp_path / "ab/map.png").is_file()
+
+    far = document(built / "b/map.json")
+    for line in far["lines"]:
+        for point in (line["anchor"], line["begin"], line["end"]):
+            point[0] += 100
+    (tmp_path / "far.json").write_text(json.dumps(far))
+    _, out, err = run("merge", built / "a/map.json", tmp_path / "far.json", "-o", tmp_path / "far")
+    assert "0 lines and 0 circles were fused into others" in out
+    assert err.endswith("are both in one frame?\n")
+
+
+def test_maps_are_compared(built: Path, run: Any) -> None:
+    maps = built / "a/map.json", built / "b/map.json"
+    status, out, err = run("compare", *maps, "--json", "--log-b", built / "b.log")
+    assert (status, err) == (0, "")
+    found = json.loads(out)
+    assert len(found["moved"]) >= 2
+    for change in found["moved"]:
+        assert change["shift_m"] == pytest.approx([0.3, 0.0], abs=0.05)
+        assert change["p_holm"] < 1e-4
+        assert change["times_detected"] >= 3
+    assert found["same_lines"] >= 4
+    for change in found["vanished"]:
+        assert change["passed"] + change["met"] >= 0
+    status, out, _ = run("compare", *maps)
+    assert status == 0
+    assert re.search(r"moved: \d lines or pieces of lines, 0 circles\n  line of .* by 0\.\d\d ± 0\.\d\d m", out)
+    assert json.loads(run("compare", maps[0], maps[0], "--json")[1])["moved"] == []
+
+
+def test_what_is_refused(built: Path, refuse: Any, tmp_path: Path) -> None:
+    good, log, to = built / "a/map.json", built / "a.log", tmp_path / "map.svg"
+    assert "its ending tells no format; give --to, or one of .json, " in refuse(
+        "export", good, "-o", tmp_path / "map.xyz"
+    )
+    for name in ("nav2", "tum"):
+        assert refuse("export", good, "-o", tmp_path / "map", "--to", name) == (
+            f"{name} is made from the scans of a log; give --log"
+        )
+    assert refuse("export", good, "-o", tmp_path / "m.pgm", "--to", "nav2", "--log", log).endswith(
+        "name the .yaml file"
+    )
+    assert "--resolution must be positive" in refuse("export", good, "-o", to, "--resolution", 0)
+    assert "million cells" in refuse("export", good, "-o", tmp_path / "m.yaml", "--log", log, "--resolution", 1e-4)
+    assert refuse("export", good, "-o", tmp_path / "none/map.svg").endswith("does not exist")
+    assert "cannot be read: No such file" in refuse("export", good, "-o", to, "--log", tmp_path / "none.log")
+
+    broken = document(good)
+    broken["lines"][0]["cov_independent"][0][0] = -1.0
+    (tmp_path / "broken.json").write_text(json.dumps(broken))
+    (tmp_path / "newer.json").write_text(json.dumps(broken | {"version": 2}))
+    for bad, cause in (
+        ("broken.json", "lines[0].cov_independent is not symmetric positive definite"),
+        ("newer.json", "has version 2; this program reads version 1"),
+        ("none.json", "No such file"),
+    ):
+        path = tmp_path / bad
+        assert cause in refuse("export", path, "-o", to)
+        assert cause in refuse("merge", good, path, "-o", tmp_path / "out")
+        assert cause in refuse("compare", path, good)
+        assert cause in refuse("build", log, "-o", tmp_path / "out", "--resume-from", path)
+    assert "--alpha must be between 0 and 1" in refuse("compare", good, good, "--alpha", 0)
+    assert "--at-least must be 1 or more" in refuse("compare", good, good, "--at-least", 0)
+    assert "--within must be positive" in refuse("compare", good, good, "--within", -1)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out/map.html").write_text("old")
+    assert "map.html exists already" in refuse("build", log, "-o", tmp_path / "out", "--html")
