@@ -142,6 +142,12 @@ def test_every_format_by_its_ending(built: Path, run: Any, tmp_path: Path) -> No
     # GeoJSON is a map to all commands, and the way back loses nothing
     assert run("export", tmp_path / "map.geojson", "--to", "json", "-o", tmp_path / "back", "--quiet") == (0, "", "")
     assert (tmp_path / "back").read_bytes() == (built / "a/map.json").read_bytes()
+    # Whoever names the picture means both files
+    assert (
+        run("export", built / "a/map.json", "--to", "nav2", "-o", tmp_path / "m.pgm", "--log", built / "a.log")[0] == 0
+    )
+    assert (tmp_path / "m.pgm").read_bytes() == (tmp_path / "map.pgm").read_bytes()
+    assert 'image: "m.pgm"' in (tmp_path / "m.yaml").read_text()
     grid = np.asarray(Image.open(tmp_path / "map.pgm"))
     assert set(np.unique(grid)) == {0, 205, 254}
     # the room is larger than the part of it that is drawn black
@@ -203,9 +209,6 @@ def test_what_is_refused(built: Path, refuse: Any, tmp_path: Path) -> None:
         assert refuse("export", good, "-o", tmp_path / "map", "--to", name) == (
             f"{name} is made from the scans of a log; give --log"
         )
-    assert refuse("export", good, "-o", tmp_path / "m.pgm", "--to", "nav2", "--log", log).endswith(
-        "name the .yaml file"
-    )
     assert "--resolution must be positive" in refuse("export", good, "-o", to, "--resolution", 0)
     assert "million cells" in refuse("export", good, "-o", tmp_path / "m.yaml", "--log", log, "--resolution", 1e-4)
     assert refuse("export", good, "-o", tmp_path / "none/map.svg").endswith("does not exist")

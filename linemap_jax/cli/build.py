@@ -123,8 +123,8 @@ class Demo:
 
 def _map_of_log(
     command: Build, log: "Log", options: dict[str, Any], before: "LineMap | None", history: History | None
-) -> tuple["LineMap", "Report", list[tuple[float, float]], list[float], bool]:
-    """The map, the reports, the positions of the robot, the seconds that each chunk took, reading included.
+) -> tuple["LineMap", "Report", list[tuple[float, float]], list[tuple[float, int]], bool]:
+    """The map, the reports, the positions of the robot, the seconds and scans of each piece, reading included.
 
     And whether somebody interrupted it: then the map is the one so far.
     """
@@ -156,7 +156,7 @@ def _map_of_log(
             reports.append(report)
             if history is not None:
                 history.add(grown)
-            seconds.append(time.perf_counter() - started)
+            seconds.append((time.perf_counter() - started, report.status.shape[0]))
             started = time.perf_counter()
     except KeyboardInterrupt:
         if line_map is None:
@@ -181,7 +181,7 @@ def _rejections(command: Build, log: "Log", options: dict[str, Any]) -> Rejectio
 
 
 def _summary(
-    command: Build, line_map: "LineMap", report: "Report", options: dict[str, Any], seconds: list[float]
+    command: Build, line_map: "LineMap", report: "Report", options: dict[str, Any], seconds: list[tuple[float, int]]
 ) -> dict[str, Any]:
     """What `build` says about its map; for machines as JSON, for people in words."""
     import numpy as np
@@ -206,9 +206,9 @@ def _summary(
         "explained": share,
         "median_line_length_m": float(np.median(length)) if length.size else 0.0,
         "duplicates": int(duplicates(lines).sum()),
-        # The first chunk holds the compilation: a log of one chunk does not tell.
-        "us_per_scan": 1e6 * float(np.median(seconds[1:])) / CHUNK if len(seconds) > 1 else None,
-        "seconds_to_first_chunk": seconds[0],
+        # The first piece holds the compilation: a log of one piece does not tell.
+        "us_per_scan": 1e6 * float(np.median([t / count for t, count in seconds[1:]])) if len(seconds) > 1 else None,
+        "seconds_to_first_chunk": seconds[0][0],
         "counts": {name: int(np.asarray(getattr(report, name)).sum()) for name in COUNTS},
     }
 

@@ -1,5 +1,6 @@
 """Reads the options, runs the command, and turns what goes wrong into one sentence."""
 
+import os
 import sys
 from typing import Annotated
 
@@ -67,6 +68,9 @@ def main(args: list[str] | None = None) -> int:
     except (LogError, OutputError, MapFileError, TableError, WorldFileError, ConfigError, UsageError) as error:
         print(f"linemap: {error}", file=sys.stderr)
         return 2
+    except BrokenPipeError:  # whoever was reading has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
     except KeyboardInterrupt:
         print("linemap: interrupted", file=sys.stderr)
         return 130

@@ -276,7 +276,9 @@ def _ragged(count: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
 
 def _affordable(sizes: Sequence[int]) -> list[int]:
     """Which moments there is room for: the last, and as many before it as fit, evenly spread."""
-    kept = list(range(len(sizes)))
-    while len(kept) > 1 and sum(sizes[i] for i in kept) > MOST_NUMBERS:
-        kept = kept[::-1][::2][::-1]
-    return kept
+    last = len(sizes) - 1
+    for count in range(len(sizes), 1, -1):
+        kept = np.rint(np.linspace(0, last, count)).astype(int).tolist()
+        if sum(sizes[i] for i in kept) <= MOST_NUMBERS:
+            return kept
+    return [last]

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from linemap_jax.io.atomic import OutputError, atomic_write
+from linemap_jax.io.atomic import atomic_write
 
 GREYS = {100: 0, 0: 254, -1: 205}
 """Of occupied, free and unknown cells, as `map_saver` writes them."""
@@ -21,23 +21,22 @@ def write_nav2(
     """Write `NAME.yaml`, and the picture `NAME.pgm` beside it.
 
     Args:
-      path: of the YAML file.
+      path: of the YAML file; another ending than .yaml or .yml gives way to .yaml.
       cells: 100 where occupied, 0 where free, -1 where unknown; row 0 is the lowest y. Shape `[H, W]`.
       origin: the lower left corner of cell (0, 0), m. Shape `[2]`.
       resolution: side of a cell, m.
       overwrite: whether older files may be replaced.
 
     Raises:
-      OutputError: if one of them exists and `overwrite` is false, or cannot be written; if `path` is a .pgm.
+      OutputError: if one of them exists and `overwrite` is false, or cannot be written.
     """
     values = np.asarray(cells)
     height, width = values.shape
     grey = np.full(values.shape, GREYS[-1], np.uint8)
     for value in (0, 100):
         grey[values == value] = GREYS[value]
-    picture = Path(path).with_suffix(".pgm")
-    if picture == Path(path):
-        raise OutputError(f"{picture} is the place of the picture; name the .yaml file")
+    path = Path(path) if Path(path).suffix in (".yaml", ".yml") else Path(path).with_suffix(".yaml")
+    picture = path.with_suffix(".pgm")
     x, y = np.asarray(origin, float).tolist()
     description = (
         f"image: {json.dumps(picture.name)}\n"  # a string of JSON is one of YAML
