@@ -20,19 +20,27 @@ from linemap_jax.cli.simulate import Simulate
 from linemap_jax.cli.trials import Trials
 from linemap_jax.cli.verify import Verify
 
+DESCRIPTION = """Maps of line segments and circles from 2D range scans, with covariances that can be believed.
+
+Maps: demo, build, export, merge, compare.
+
+Logs: info, extract, calibrate, config.
+
+Laboratory: simulate, evaluate, trials, verify."""
+
 Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Build, tyro.conf.subcommand("build")]
-    | Annotated[Extract, tyro.conf.subcommand("extract")]
-    | Annotated[Info, tyro.conf.subcommand("info")]
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Merge, tyro.conf.subcommand("merge")]
     | Annotated[Compare, tyro.conf.subcommand("compare")]
+    | Annotated[Info, tyro.conf.subcommand("info")]
+    | Annotated[Extract, tyro.conf.subcommand("extract")]
+    | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
+    | Annotated[Config, tyro.conf.subcommand("config")]
     | Annotated[Simulate, tyro.conf.subcommand("simulate")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Trials, tyro.conf.subcommand("trials")]
-    | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
-    | Annotated[Config, tyro.conf.subcommand("config")]
     | Annotated[Verify, tyro.conf.subcommand("verify")]
 )
 """What can be run; each holds its options."""
@@ -51,7 +59,7 @@ def main(args: list[str] | None = None) -> int:
     command = tyro.cli(
         Command,
         prog="linemap",
-        description="Maps of line segments and circles from 2D range scans, with covariances that can be believed.",
+        description=DESCRIPTION,
         config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
         args=args,
     )
