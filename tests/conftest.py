@@ -30,6 +30,23 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 
+LONGEST = (
+    "test_oracle",
+    "test_notebooks",
+    "test_consistency",
+    "test_cli",
+    "test_gradients",
+    "test_trials",
+    "test_readme",
+)
+"""Files that begin first, since the tests of one stay in one process: no other shall wait for it at the end."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest files first; else as they were."""
+    items.sort(key=lambda item: LONGEST.index(item.path.stem) if item.path.stem in LONGEST else len(LONGEST))
+
+
 @pytest.fixture(scope="session")
 def data() -> Callable[[str], Path]:
     """Gives the path of a real log in $LINEMAP_DATA, and skips the test where it is not there."""
