@@ -394,7 +394,7 @@ def test_what_no_noise_can_be_told_from_is_refused(refuse, tmp_path: Path, drive
     log = drive / "scans.log.gz"
     assert refuse("calibrate", log, "--lag", 0).startswith("--lag must be from 1")
     assert refuse("calibrate", log, "--scans", 1).startswith("--scans must be from 2")
-    assert refuse("calibrate", log, "--range-max", -1) == "--range-max must be positive, not -1.0"
+    assert refuse("calibrate", log, "--range-max", -1).startswith("--range-max must be positive")
     assert refuse("calibrate", log, "--laser-offset", "nan", 0, 0).startswith("--laser-offset must be finite")
     (tmp_path / "noise.toml").write_text("")
     assert "--overwrite" in refuse("calibrate", log, "-o", tmp_path / "noise.toml")
