@@ -1,6 +1,6 @@
-"""How long a scan takes, beside a scalar C++ extractor of section 4 in the same run: the table in README.
+"""How long a scan takes, beside a scalar C++ extractor of section 4 in the same run.
 
-Usage: python scripts/bench.py [--quick] [--json FILE] [--write]
+Usage: python scripts/bench.py [--quick] [--json FILE]
 
 Rows:
 
@@ -57,7 +57,6 @@ from linemap_jax.lab import generators, scanners, simulate  # noqa: E402
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("LINEMAP_DATA", ROOT / "../shared/data"))
 BASELINE = Path(os.environ.get("LINEMAP_BASELINE", ROOT / "../shared/tools/baseline"))
-BEGIN, END = "<!-- bench:begin -->", "<!-- bench:end -->"
 PIECE = 256
 """Scans that are worked on side by side."""
 SIGMAS = (0.05, 0.05, 0.0175)
@@ -69,24 +68,18 @@ Row = dict[str, Any]
 
 
 def main() -> int:
-    """Measure, print the table, and write what is asked for."""
+    """Measure, print the table, and write the rows where that is asked for."""
     parser = argparse.ArgumentParser(description="How long a scan takes, beside a C++ extractor.")
     parser.add_argument("--quick", action="store_true", help="three rows, within a minute")
     parser.add_argument("--json", type=Path, help="write the rows to this file")
-    parser.add_argument("--write", action="store_true", help="write the table into README")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         jax.config.update("jax_compilation_cache_dir", folder)
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         rows = list(measure(options.quick, Cpp.compiled(Path(folder))))
-    table = as_table(rows)
-    print(table)
+    print(as_table(rows))
     if options.json:
         options.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
-    if options.write:
-        readme = ROOT / "README.md"
-        before, rest = readme.read_text().split(BEGIN)
-        readme.write_text(f"{before}{BEGIN}\n{table}\n{END}{rest.split(END)[1]}")
     return 0
 
 
