@@ -106,6 +106,8 @@ def best_polyline(
 
     def body(carry: tuple, x: tuple) -> tuple[tuple, tuple]:
         fit: _Fit = carry[0]
+        prior_a: Array
+        prior_u: Array
         prior_a, prior_u, prior_c, open_c = carry[1:]
         j, angle, range_, inverse_j, weight, price, follows, counts, valid = x
         # The lines that hold this point
