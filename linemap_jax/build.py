@@ -20,7 +20,7 @@ from linemap_jax.core.settings import SCAN_CAPACITY, Capacity
 from linemap_jax.core.slots import resize
 from linemap_jax.core.state import LEFT_OUT, Extraction, LineMap, Pose, Report, Scan, Status, pad_stack
 
-STATIC = ("pose_error", "capacity", "rules", "segmentation", "covariance", "jacobians")
+STATIC = ("pose_error", "capacity", "rules", "segmentation", "max_vertices", "covariance", "jacobians")
 """Options of `update` that decide which program it is."""
 
 COMPILER_OPTIONS = {"xla_cpu_use_fusion_emitters": False}

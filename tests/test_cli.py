@@ -518,6 +518,8 @@ def test_settings_files_that_are_wrong(refuse, log, tmp_path, content, told):
         "--range-min 3 --range-max 2",
         "--laser-offset 0 0 inf",
         "--every 0",
+        "--max-vertices 10",
+        "--segmentation optimal --max-vertices 1",
         "--every -2",
     ],
 )

@@ -12,6 +12,8 @@ from linemap_jax.cli.compilations import keep_compilations
 if TYPE_CHECKING:
     from linemap_jax.core.settings import SensorNoise
 
+MOST_VERTICES = 1000
+"""Of a budget: no scanner has more to say, and memory grows with it."""
 MOST_SCANS = 20_000
 """Of a simulated drive, which is held in memory as a whole."""
 
@@ -70,8 +72,10 @@ class LogOptions(LogInput):
     """`exact` to first order, or eq. 12 as `printed`. That of the preset unless given."""
     jacobians: Literal["autodiff", "analytic"] = "analytic"
     """Derivatives by autodiff through the estimate, or the hand-derived ones; the maps are the same."""
-    segmentation: Literal["incremental"] = "incremental"
-    """How points are divided into lines."""
+    segmentation: Literal["incremental", "optimal"] = "incremental"
+    """How points are divided into lines: by the paper's criteria, or so that the lines explain them best."""
+    max_vertices: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """With `optimal`: lines of at most so many end points a scan; a corner that two lines share counts once."""
     every: Annotated[int, tyro.conf.arg(metavar="N")] = 1
     """Take every N-th scan."""
     dtype: Literal["float32", "float64"] = "float32"
@@ -97,7 +101,11 @@ def options_of_update(command: LogOptions) -> dict[str, Any]:
     options["noise"] = dataclasses.replace(options["noise"], **given)
     if command.covariance is not None:
         options["covariance"] = command.covariance
-    return options | {"jacobians": command.jacobians, "segmentation": command.segmentation}
+    return (
+        options
+        | {"jacobians": command.jacobians, "segmentation": command.segmentation}
+        | ({} if command.max_vertices is None else {"max_vertices": command.max_vertices})
+    )
 
 
 def options_of_method(
@@ -139,6 +147,11 @@ def _check(command: LogOptions) -> None:
         raise UsageError(f"--bearing-sigma must be zero or positive, not {command.bearing_sigma}")
     if not all(0 <= x < inf for x in command.pose_sigma):
         raise UsageError(f"--pose-sigma must be zero or positive, not {command.pose_sigma}")
+    if command.max_vertices is not None:
+        if command.segmentation != "optimal":
+            raise UsageError("--max-vertices needs --segmentation optimal")
+        if not 2 <= command.max_vertices <= MOST_VERTICES:
+            raise UsageError(f"--max-vertices must be from 2 to {MOST_VERTICES}, not {command.max_vertices}")
 
 
 def check_input(command: LogInput) -> None:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from linemap_jax.core import circles as circles_
 from linemap_jax.core.lines import MIN_POINTS, choose_points, length_of_run, measure_lines
 from linemap_jax.core.runs import select_runs
-from linemap_jax.core.segmentation import incremental
+from linemap_jax.core.segmentation import incremental, optimal
 from linemap_jax.core.sensor import Points, points_from_scan
 from linemap_jax.core.settings import (
     SCAN_CAPACITY,
@@ -28,7 +28,7 @@ from linemap_jax.core.slots import neutral_where_free
 from linemap_jax.core.state import Extraction, Pose, Rejected, Scan, Status
 
 
-@partial(jax.jit, static_argnames=("capacity", "rules", "segmentation", "covariance", "jacobians"))
+@partial(jax.jit, static_argnames=("capacity", "rules", "segmentation", "max_vertices", "covariance", "jacobians"))
 def extract(
     scan: Scan,
     pose: Pose,
@@ -39,6 +39,7 @@ def extract(
     capacity: Capacity = SCAN_CAPACITY,
     rules: Rules = Rules(),
     segmentation: Segmentation = "incremental",
+    max_vertices: int | None = None,
     covariance: Covariance = "exact",
     jacobians: Jacobians = "autodiff",
 ) -> Extraction:
@@ -55,7 +56,9 @@ def extract(
       mount: of the scanner on the robot; at its centre, looking ahead, unless given.
       capacity: slots for lines and circles. What does not fit is left out, in beam order, and the status tells.
       rules: which reading of the method.
-      segmentation: "incremental", the paper's criteria.
+      segmentation: "incremental", the paper's criteria, or "optimal", the runs that explain the points best.
+      max_vertices: of "optimal": a budget of end points for the scan, 2 or more; a corner that two lines share counts
+        once. The lines are then those of polylines, down to two points each, and have slots for all of the budget.
       covariance: "exact", to first order with the pose error that all points share, or "printed", Eq. (12).
       jacobians: "autodiff" through the estimate, or "analytic", the hand-derived ones.
 
@@ -72,6 +75,7 @@ def extract(
         capacity=capacity,
         rules=rules,
         segmentation=segmentation,
+        max_vertices=max_vertices,
         covariance=covariance,
         jacobians=jacobians,
     )
@@ -90,6 +94,7 @@ def observe(
     segmentation: Segmentation,
     covariance: Covariance,
     jacobians: Jacobians,
+    max_vertices: int | None = None,
 ) -> tuple[Points, Pose, Extraction]:
     """`extract`, with all that a map is updated by.
 
@@ -104,6 +109,7 @@ def observe(
       segmentation: how points are divided into lines.
       covariance: "exact" or "printed".
       jacobians: "autodiff" or "analytic".
+      max_vertices: of "optimal".
 
     Returns:
       The points; the pose, made finite; and what the points hold.
@@ -118,6 +124,7 @@ def observe(
         capacity=capacity,
         rules=rules,
         segmentation=segmentation,
+        max_vertices=max_vertices,
         covariance=covariance,
         jacobians=jacobians,
     )
@@ -146,25 +153,41 @@ def extract_points(
     capacity: Capacity,
     rules: Rules,
     segmentation: Segmentation,
+    max_vertices: int | None,
     covariance: Covariance,
     jacobians: Jacobians,
 ) -> Extraction:
     """`extract`, from the points of the scan on."""
-    if segmentation != "incremental":
-        raise ValueError(f"segmentation must be 'incremental', not {segmentation!r}")
-    ends, run, breaks = incremental.segment(points, thresholds, noise, rules)
+    segmented, chosen = None, points.valid
+    if segmentation == "optimal":
+        segmented = optimal.segment(points, thresholds, noise, max_vertices=max_vertices)
+        points, ends, run, breaks = segmented.points, segmented.ends, segmented.run, segmented.breaks
+        chosen = segmented.on_line
+    elif max_vertices is not None:
+        raise ValueError("max_vertices is for segmentation='optimal'")
+    elif segmentation == "incremental":
+        ends, run, breaks = incremental.segment(points, thresholds, noise, rules)
+    else:
+        raise ValueError(f"segmentation must be 'incremental' or 'optimal', not {segmentation!r}")
     few = run.n < MIN_POINTS
     short = length_of_run(run, points.position) <= thresholds.min_length
-    runs, lines_full = select_runs(run.n, ends & ~few & ~short, capacity.lines)
+    if max_vertices is not None:
+        few, short = ~chosen, jnp.zeros_like(chosen)
+    slots = max(capacity.lines, max_vertices or 0)
+    runs, lines_full = select_runs(run.n, ends & chosen & ~few & ~short, slots)
     lines, jac_line_pose, cov_measurement = measure_lines(
         points,
         pose,
-        choose_points(points, runs, thresholds, noise, rules),
+        runs if max_vertices is not None else choose_points(points, runs, thresholds, noise, rules),
         noise,
         maximum_likelihood=rules.maximum_likelihood,
         covariance=covariance,
         jacobians=jacobians,
     )
+    if segmented is not None and max_vertices is not None:
+        lines = optimal.lines_of_polyline(lines, segmented, pose)
+    elif segmented is not None:
+        lines = optimal.join_corners(lines, runs, segmented, pose)
 
     cluster_ends, size = circles_.cluster(points, points.valid & (runs.of_point < 0), thresholds)
     lone = size < 2

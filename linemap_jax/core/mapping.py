@@ -54,7 +54,10 @@ def empty_map(capacity: Capacity = Capacity(), dtype: jnp.dtype | type | None = 
     return LineMap(lines=empty_lines(capacity.lines, dtype), circles=empty_circles(capacity.circles, dtype))
 
 
-@partial(jax.jit, static_argnames=("pose_error", "capacity", "rules", "segmentation", "covariance", "jacobians"))
+@partial(
+    jax.jit,
+    static_argnames=("pose_error", "capacity", "rules", "segmentation", "max_vertices", "covariance", "jacobians"),
+)
 def update(
     line_map: LineMap,
     scan: Scan,
@@ -68,6 +71,7 @@ def update(
     capacity: Capacity = SCAN_CAPACITY,
     rules: Rules = Rules(),
     segmentation: Segmentation = "incremental",
+    max_vertices: int | None = None,
     covariance: Covariance = "exact",
     jacobians: Jacobians = "autodiff",
 ) -> tuple[LineMap, Report]:
@@ -89,6 +93,7 @@ def update(
       capacity: slots for the lines and circles of the scan (those of the map are its own).
       rules: which reading of the method.
       segmentation: as for `extract`.
+      max_vertices: as for `extract`.
       covariance: as for `extract`.
       jacobians: as for `extract`.
 
@@ -111,6 +116,7 @@ def update(
         capacity=capacity,
         rules=rules,
         segmentation=segmentation,
+        max_vertices=max_vertices,
         covariance=covariance,
         jacobians=jacobians,
     )

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from linemap_jax.core.state import positional_pytree, pytree
 
 Number = float | Float[Array, ""]
-Segmentation = Literal["incremental"]
+Segmentation = Literal["incremental", "optimal"]
 Covariance = Literal["exact", "printed"]
 Jacobians = Literal["autodiff", "analytic"]
 PoseError = Literal["independent", "persistent", "unknown"]
