@@ -10,4 +10,7 @@ AS_USERS: Any = {"xla_backend_optimization_level": 3, "xla_cpu_use_fusion_emitte
 AS_BUILD: Any = AS_USERS | {"xla_cpu_use_fusion_emitters": False}
 """As `linemap_jax.build` does it."""
 
+A_LITTLE: Any = AS_BUILD | {"xla_backend_optimization_level": 1}
+"""As little as does not change results, see tests/core/test_gradients.py."""
+
 as_built = partial(jax.jit, compiler_options=AS_BUILD)

@@ -17,7 +17,7 @@ from linemap_jax.core.state import LEFT_OUT, Pose, Scan
 
 SCAN = Capacity(64, 96)
 MAP = Capacity(512, 512)
-EVERY = {"intel": 3, "aces": 3, "fhw": 3, "freiburg-079": 24}
+EVERY = {"intel": 8, "aces": 8, "fhw": 8, "freiburg-079": 48}
 """Every n-th scan is compared: the oracle takes 5 ms for one."""
 
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import as_built
+from compiling import A_LITTLE
 
 from linemap_jax import Capacity, LineMap, Mount, Pose, Scan, SensorNoise, empty_map, extract, preset, update
 from linemap_jax.core.settings import Thresholds
@@ -103,7 +103,7 @@ def test_gradients_of_an_extraction_are_finite(name: str, jacobians: str) -> Non
 def test_gradients_of_a_map_are_finite(name: str) -> None:
     """In forward mode: wiping loops over as many lines as are cut, which has no reverse."""
     # Not optimised at all, XLA (jax 0.8.3) reads one number of this program twice, and the second time as NaN.
-    gradient = as_built(jax.jacfwd(of_map), static_argnames="name")
+    gradient = jax.jit(jax.jacfwd(of_map), static_argnames="name", compiler_options=A_LITTLE)
     full = scans()["room"]
     step = jax.jit(partial(update, capacity=SCAN, **preset(name)))
     # The map of another view, so that lines and circles are fused, added and wiped
