@@ -28,6 +28,28 @@ def rotate(angle: Float[Array, ""], vector: Float[Array, "2"]) -> Float[Array, "
     return vector[0] * unit(angle) + vector[1] * perp(unit(angle))
 
 
+def compose(pose: Float[Array, "3"], step: Float[Array, "3"]) -> Float[Array, "3"]:
+    """The pose that is reached from a pose by a step seen from there, both x, y, theta. m, m, rad in (-pi, pi]."""
+    return jnp.concatenate([pose[:2] + rotate(pose[2], step[:2]), wrap_angle(pose[2:] + step[2:])])
+
+
+def between(before: Float[Array, "3"], after: Float[Array, "3"]) -> Float[Array, "3"]:
+    """The step from one pose to another, seen from the first: `compose(before, step)` is `after`. m, m, rad."""
+    return jnp.concatenate([rotate(-before[2], after[:2] - before[:2]), wrap_angle(after[2:] - before[2:])])
+
+
+def jac_compose_pose(pose: Float[Array, "3"], step: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """The derivative of `compose(pose, step)` by the pose, derived by hand."""
+    return jnp.eye(3, dtype=pose.dtype).at[:2, 2].set(perp(rotate(pose[2], step[:2])))
+
+
+def jac_compose_step(pose: Float[Array, "3"], step: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """The derivative of `compose(pose, step)` by the step, derived by hand."""
+    ahead = unit(pose[2])
+    turned = jnp.stack([ahead, perp(ahead)], -1)
+    return jnp.eye(3, dtype=pose.dtype).at[:2, :2].set(turned)
+
+
 def dot(a: Float[Array, "*#s 2"], b: Float[Array, "*#s 2"]) -> Float[Array, "..."]:
     """Scalar product of plane vectors."""
     return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1]

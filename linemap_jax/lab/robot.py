@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from linemap_jax.core.frames import unit, wrap_angle
+from linemap_jax.core.frames import between, unit, wrap_angle
 from linemap_jax.core.propagation import square_root
 from linemap_jax.core.settings import Number
 from linemap_jax.core.state import Pose, pytree
@@ -128,11 +128,7 @@ class Odometry:
 
 def increments(poses: Float[Array, "T 3"]) -> Float[Array, "T-1 3"]:
     """Each pose but the first, seen from the one before it: x ahead, y to the left, turn. m, m, rad."""
-    step = jnp.diff(poses, axis=0)
-    c, s = jnp.cos(poses[:-1, 2]), jnp.sin(poses[:-1, 2])
-    ahead = c * step[:, 0] + s * step[:, 1]
-    left = -s * step[:, 0] + c * step[:, 1]
-    return jnp.stack([ahead, left, wrap_angle(step[:, 2])], -1)
+    return jax.vmap(between)(poses[:-1], poses[1:])
 
 
 def read_odometry(key: Array, poses: Float[Array, "T 3"], odometry: Odometry) -> Float[Array, "T-1 3"]:
