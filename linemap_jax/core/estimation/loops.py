@@ -1,0 +1,182 @@
+"""Whether a keyframe sees what older ones have seen, and from where: what closes a loop.
+
+Where the path between them is short, registration finds the pose by itself. Where the drift may be metres, a
+correlative search (Olson 2009) goes over all poses that it leaves possible: the older surface is drawn into a grid, and
+the points of the newer one are counted on it. The best of them are registered, and the one in which most points agree
+is believed if no other place agrees nearly as well: corridors look alike wherever one stands.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from linemap_jax.core.estimation.registration import RegistrationSettings, register
+from linemap_jax.core.estimation.surface import Surface, seen_from
+from linemap_jax.core.frames import wrap_angle
+from linemap_jax.core.settings import Number
+from linemap_jax.core.state import pytree
+
+CELL = 0.3
+"""m, of the grid."""
+REACH = 34
+"""Cells that the search goes in each direction: 10 m."""
+SPAN = 100
+"""Cells from the middle of the grid to its edge: 30 m."""
+TURN = 0.0436
+"""rad, from one direction of the search to the next: 2.5 degrees, half a cell at 3.4 m."""
+TURNS = 12
+"""Directions to either side: 30 degrees."""
+THINNING = 3
+"""Every n-th point takes part in the search."""
+HYPOTHESES = 10
+"""Poses that are registered."""
+
+
+@pytree
+class LoopSettings:
+    """When a loop is believed to be closed."""
+
+    drift_per_metre: Number = 0.04
+    """How uncertain the step between two keyframes is, for each metre of the shortest path between them."""
+    least_drift: Number = 0.05
+    """The same where the path has no length, m."""
+    turn_drift_per_metre: Number = 0.005
+    """The same for the direction, rad / m."""
+    search_from: Number = 0.3
+    """Uncertainty from which the pose is searched for, m."""
+    share_near: Number = 0.6
+    """Least share of the points that must agree, where the pose is known well."""
+    share_far: Number = 0.7
+    """The same where it had to be searched for."""
+    runner_up: Number = 0.85
+    """Largest share that may agree in another place, relative to the best."""
+    apart: Number = 0.4
+    """What is another place, m."""
+    turned_apart: Number = 0.1
+    """What is another direction, rad."""
+
+
+class Closure(NamedTuple):
+    """What a keyframe says of an older one."""
+
+    step: Float[Array, "3"]  # pose of the newer one, seen from the older. m, m, rad
+    information: Float[Array, "3 3"]  # as if the points' errors were independent
+    share: Float[Array, ""]  # of the points, those that agree
+    believed: Bool[Array, ""]
+
+
+def joined(surfaces: Surface, poses: Float[Array, "S 3"], valid: Bool[Array, " S"]) -> Surface:
+    """Several surfaces in one frame, that in which the poses are given. `[S, M]` in, `[S * M]` out."""
+    moved = jax.vmap(seen_from)(surfaces, poses)
+    moved = Surface(
+        position=moved.position, normal=moved.normal, flat=moved.flat, valid=moved.valid & valid[:, None]
+    )
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), moved)
+
+
+def close_loop(
+    new: Surface,
+    surfaces: Surface,
+    poses: Float[Array, "S 3"],
+    valid: Bool[Array, " S"],
+    guess: Float[Array, "3"],
+    path: Float[Array, ""],
+    settings: LoopSettings = LoopSettings(),
+    registration: RegistrationSettings = RegistrationSettings(),
+) -> Closure:
+    """Lay a keyframe onto the surfaces of older ones.
+
+    Args:
+      new: surface of the keyframe.
+      surfaces: of an older keyframe and those before and after it. `[S, M]`.
+      poses: of these, seen from the older one. m, m, rad.
+      valid: which of these there are.
+      guess: pose of the newer keyframe, seen from the older one.
+      path: shortest path between the two, m.
+      settings: what is believed.
+      registration: of the keyframe.
+    """
+    surface = joined(surfaces, poses, valid)
+    drift = settings.least_drift + settings.drift_per_metre * path
+    turn_drift = settings.least_drift + settings.turn_drift_per_metre * path
+
+    def near(_: None) -> Closure:
+        prior = jnp.diag(jnp.asarray([0.04, 0.04, 1.0], guess.dtype))  # nearly nothing: the points are to say it
+        found = register(new, surface, guess, prior, registration, iterations=15)
+        return Closure(*found, believed=found.share >= settings.share_near)
+
+    def far(_: None) -> Closure:
+        prior = jnp.diag(jnp.stack([1 / drift**2, 1 / drift**2, 1 / turn_drift**2])) * 1e-3
+        starts, score = search(new, surface, guess, drift, turn_drift)
+        found = jax.vmap(lambda start: register(new, surface, start, prior, registration, iterations=20))(starts)
+        share = jnp.where(score > 0.3, found.share, 0)
+        best = jnp.argmax(share)
+        at = jax.tree.map(lambda x: x[best], found)
+        off = found.pose - at.pose
+        other = jnp.abs(wrap_angle(off[:, 2])) > settings.turned_apart
+        other = other | (jnp.sum(off[:, :2] ** 2, -1) > settings.apart**2)
+        runner_up = jnp.max(jnp.where(other, share, 0))
+        believed = (share[best] >= settings.share_far) & (runner_up <= settings.runner_up * share[best])
+        return Closure(at.pose, at.information, share[best], believed)
+
+    return jax.lax.cond(drift > settings.search_from, far, near, None)
+
+
+def search(
+    new: Surface,
+    surface: Surface,
+    guess: Float[Array, "3"],
+    drift: Float[Array, ""],
+    turn_drift: Float[Array, ""],
+) -> tuple[Float[Array, "H 3"], Float[Array, " H"]]:
+    """The poses about a guess in which most points of one surface fall on another.
+
+    Args:
+      new: the one, in its own frame.
+      surface: the other, in the frame of the pose; drawn within 30 m of the origin.
+      guess: the pose. m, m, rad.
+      drift: standard deviation of its position, m; what is three of them away is left out.
+      turn_drift: of its direction, rad.
+
+    Returns:
+      `HYPOTHESES` poses, the best first, and the share of the points that falls on the surface.
+    """
+    grid = _drawn(surface)
+    window = jnp.arange(-REACH, REACH + 1)
+    turns = TURN * jnp.arange(-TURNS, TURNS + 1).astype(guess.dtype)
+    moves = CELL * window.astype(guess.dtype)
+    thinned = jax.tree.map(lambda x: x[::THINNING], new)
+    margin = SPAN + 2 * REACH
+    padded = jnp.pad(grid, margin)
+
+    def count(turn: Array) -> Array:
+        points = seen_from(thinned, guess.at[2].add(turn)).position
+        cell = jnp.clip(jnp.floor(points / CELL).astype(jnp.int32), -SPAN - REACH, SPAN + REACH)
+        corner = cell + SPAN + margin - REACH
+        seen = jax.vmap(lambda c: jax.lax.dynamic_slice(padded, (c[0], c[1]), (window.size, window.size)))(corner)
+        return jnp.sum(jnp.where(thinned.valid[:, None, None], seen, 0), 0)
+
+    score = jax.lax.map(count, turns) / jnp.maximum(jnp.sum(thinned.valid), 1).astype(guess.dtype)
+    far = (moves[:, None] ** 2 + moves[None] ** 2) / drift**2 + (turns[:, None, None] / turn_drift) ** 2
+    liked = jnp.where(far > 9, -1, score - 0.02 * far)  # of two that count alike, the nearer one
+
+    def pick(liked: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
+        best = jnp.unravel_index(jnp.argmax(liked), liked.shape)
+        pose = guess + jnp.stack([moves[best[1]], moves[best[2]], turns[best[0]]])
+        away = (jnp.abs(window - window[best[1]])[:, None] > 3) | (jnp.abs(window - window[best[2]])[None] > 3)
+        away = away | (jnp.abs(jnp.arange(turns.size) - best[0]) > 2)[:, None, None]
+        return jnp.where(away, liked, -2), (pose, score[best])
+
+    return jax.lax.scan(pick, liked, None, length=HYPOTHESES)[1]
+
+
+def _drawn(surface: Surface) -> Float[Array, "G G"]:
+    """A grid in which cells with a point count 1, those beside them a half."""
+    cell = jnp.floor(surface.position / CELL).astype(jnp.int32) + SPAN
+    cell = jnp.where(surface.valid[:, None] & jnp.all((cell >= 0) & (cell < 2 * SPAN), -1)[:, None], cell, 2 * SPAN)
+    dtype = surface.position.dtype
+    grid = jnp.zeros((2 * SPAN, 2 * SPAN), dtype).at[cell[:, 0], cell[:, 1]].set(1, mode="drop")
+    beside = jax.lax.reduce_window(grid, jnp.zeros((), dtype), jax.lax.max, (3, 3), (1, 1), "SAME")
+    return (grid + beside) / 2

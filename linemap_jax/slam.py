@@ -1,0 +1,283 @@
+"""A map and a trajectory from raw odometry: the host loop around tracking, loop closing and the pose graph.
+
+Scans are tracked in chunks of one size. After each chunk its keyframes are compared with older ones that look at the
+same place; where loops are closed, the graph is optimised. Memory grows with the number of keyframes, not of scans.
+"""
+
+import dataclasses
+from collections.abc import Iterable, Iterator
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
+
+from linemap_jax.core.estimation.loops import Closure, LoopSettings, close_loop
+from linemap_jax.core.estimation.odometry import OdometryNoise
+from linemap_jax.core.estimation.pose_graph import SURE, Closures, PoseGraph, cov_of_registration, optimise
+from linemap_jax.core.estimation.registration import RegistrationSettings
+from linemap_jax.core.estimation.surface import Surface, middle_of
+from linemap_jax.core.estimation.tracking import Track, Tracked, TrackingSettings, begin_track, track_chunk
+from linemap_jax.core.state import Scan, pad_stack
+
+CHUNK = 64
+"""Scans in one jitted call."""
+NEWER = 15
+"""A keyframe is not compared with so many before it, which tracking has seen."""
+BESIDE = 4
+"""Keyframes before and after an older one that are laid together with it."""
+CANDIDATES = 2
+"""Older keyframes that a keyframe is compared with, at most."""
+CANDIDATES_APART = 8
+"""Of these, how many keyframes lie between two."""
+LOOK_APART = 2.0
+"""m. Two keyframes may see the same place if the middles of what they see are no farther apart than this and twice what
+the drift may be."""
+FARTHEST = 12.0
+"""m. The same, at most."""
+CLOSED = 0.3
+"""m. A closure counts as a path of this length."""
+
+_START = 512  # keyframes that there is room for at first
+_LEAST_INFORMATION = np.diag([1.0, 1.0, 10.0])  # of a closure, beside its points: 1 m, 0.3 rad
+
+
+@dataclasses.dataclass
+class _Keyframes:
+    """What is kept of the keyframes."""
+
+    tracked: list[np.ndarray] = dataclasses.field(default_factory=list)  # [3] pose by tracking
+    step: list[np.ndarray] = dataclasses.field(default_factory=list)  # [3] from the one before
+    cov_step: list[np.ndarray] = dataclasses.field(default_factory=list)
+    middle: list[np.ndarray] = dataclasses.field(default_factory=list)  # [2] of what it sees, in its own frame
+    surface: list[Surface] = dataclasses.field(default_factory=list)
+
+
+class Slam:
+    """Simultaneous localisation and mapping, chunk by chunk.
+
+    The trajectory is given in the frame in which odometry began. Its poses are those of the scanner.
+    """
+
+    def __init__(
+        self,
+        *,
+        noise: OdometryNoise = OdometryNoise(),
+        tracking: TrackingSettings = TrackingSettings(),
+        registration: RegistrationSettings = RegistrationSettings(),
+        loops: LoopSettings = LoopSettings(),
+    ) -> None:
+        """An empty one; the settings are those of the functions of the same names."""
+        options = {"noise": noise, "settings": tracking, "registration": registration}
+        self._track = partial(_jit_track, **options)
+        self._loops = loops
+        self._close = partial(_jit_close, settings=loops, registration=registration)
+        self._state: Track | None = None
+        self._keyframes = _Keyframes()
+        self._poses = np.zeros((0, 3))  # of the keyframes, by the graph
+        self._closures: list[tuple[int, int, np.ndarray, np.ndarray]] = []
+        self._weight = np.zeros(0)
+        self._keyframe_of_scan: list[np.ndarray] = []
+        self._seen_from_keyframe: list[np.ndarray] = []
+        self.shares: list[np.ndarray] = []
+
+    def add(self, scans: Scan, odometry: Float[Array, "T 3"]) -> None:
+        """Go on by some scans.
+
+        Args:
+          scans: at most `CHUNK`, stacked.
+          odometry: poses of the scanner by the robot's odometry. m, m, rad.
+        """
+        count = scans.ranges.shape[0]
+        if self._state is None:
+            self._state = begin_track(odometry[0], jax.tree.map(lambda x: x[0], scans))
+        odometry = jnp.asarray(odometry, scans.ranges.dtype)
+        self._state, said = self._track(
+            self._state, pad_stack(scans, CHUNK), pad_stack(odometry, CHUNK), jnp.arange(CHUNK) < count
+        )
+        said = jax.tree.map(lambda x: np.asarray(x)[:count], said)
+        self.shares.append(said.share)
+        begin = len(self._keyframes.step)
+        self._take(said)
+        if self._close_loops(begin):
+            self._optimise()
+
+    def _take(self, said: Tracked) -> None:
+        """Keep the keyframes of a chunk, and where its scans lie against them."""
+        kept, odometry = self._keyframes, np.zeros(3)
+        prior = np.diag([1 / 0.3**2, 1 / 0.3**2, 1 / 0.15**2])  # what odometry says at least, over one step
+        middles = np.asarray(_jit_middles(said.surface))
+        covs = np.asarray(
+            cov_of_registration(jnp.asarray(said.information, float), jnp.asarray(np.tile(prior, (len(middles), 1, 1))))
+        )
+        owner, seen = np.zeros(len(middles), int), np.zeros((len(middles), 3))
+        for i in range(len(middles)):
+            if said.is_keyframe[i]:
+                first = not kept.step
+                kept.tracked.append(said.pose[i].astype(float))
+                kept.step.append(np.zeros(3) if first else said.step[i].astype(float))
+                kept.cov_step.append(covs[i])
+                kept.middle.append(middles[i])
+                kept.surface.append(jax.tree.map(lambda x, i=i: x[i], said.surface))
+                pose = kept.tracked[-1] if first else _compose(self._poses[-1], kept.step[-1])
+                self._poses = np.concatenate([self._poses, pose[None]])
+            else:
+                seen[i] = said.step[i]
+            owner[i] = len(kept.step) - 1
+        self._keyframe_of_scan.append(owner)
+        self._seen_from_keyframe.append(seen)
+
+    def _close_loops(self, begin: int) -> bool:
+        """Compare the keyframes from `begin` on with older ones; whether that closed a loop."""
+        kept, poses = self._keyframes, self._poses
+        middles = np.array([_compose(pose, [*middle, 0])[:2] for pose, middle in zip(poses, kept.middle, strict=True)])
+        found = []
+        for i in range(max(begin, NEWER + 1), len(poses)):
+            path = self._shortest_paths(i, found)[: i - NEWER]
+            drift = self._loops.least_drift + self._loops.drift_per_metre * path
+            apart = np.hypot(*(middles[: i - NEWER] - middles[i]).T)
+            near = apart < np.minimum(LOOK_APART + 2 * drift, FARTHEST)
+            for j in _spread(np.argsort(np.where(near, apart, np.inf))[: near.sum()]):
+                closure = self._compare(i, j, path[j])
+                if closure.believed:
+                    cov = cov_of_registration(
+                        jnp.asarray(closure.information, float), jnp.asarray(_LEAST_INFORMATION)
+                    )
+                    found.append((j, i, np.asarray(closure.step, float), np.asarray(cov)))
+        self._closures += found
+        self._weight = np.concatenate([self._weight, np.ones(len(found))])
+        return bool(found)
+
+    def _compare(self, i: int, j: int, path: float) -> Closure:
+        """Lay a keyframe onto an older one and its neighbours, at fixed shapes."""
+        kept, poses = self._keyframes, self._poses
+        dtype = kept.surface[i].position.dtype
+        around = np.arange(j - BESIDE, j + BESIDE + 1)
+        valid = (around >= 0) & (around <= i - NEWER + BESIDE)
+        around = np.clip(around, 0, len(poses) - 1)
+        surfaces = jax.tree.map(lambda *x: np.stack(x), *(kept.surface[k] for k in around))
+        seen = np.array([_between(poses[j], poses[k]) for k in around]).astype(dtype)
+        guess = _between(poses[j], poses[i]).astype(dtype)
+        return jax.device_get(self._close(kept.surface[i], surfaces, seen, valid, guess, np.asarray(path, dtype)))
+
+    def _shortest_paths(self, i: int, found: list[Any]) -> np.ndarray:
+        """Length of the shortest path from keyframe `i` to each, over the chain and the closures that are believed."""
+        steps = np.array(self._keyframes.step)
+        closures = [c for c, w in zip(self._closures, self._weight, strict=True) if w > SURE] + found
+        begin = np.concatenate([np.arange(len(steps) - 1), [c[0] for c in closures]]).astype(int)
+        end = np.concatenate([np.arange(1, len(steps)), [c[1] for c in closures]]).astype(int)
+        length = np.concatenate([np.hypot(steps[1:, 0], steps[1:, 1]) + 0.01, np.full(len(closures), CLOSED)])
+        graph = csr_array((length, (begin, end)), shape=(len(steps), len(steps)))
+        return dijkstra(graph, directed=False, indices=i)
+
+    def _optimise(self) -> None:
+        """Let the graph settle."""
+        graph, weight = _jit_optimise(self.graph())
+        count, closures = len(self._poses), len(self._closures)
+        self._poses = np.asarray(graph.poses)[:count]
+        self._weight = np.asarray(weight)[:closures]
+
+    def graph(self) -> PoseGraph:
+        """Keyframes and closures, padded to powers of two."""
+        kept, count = self._keyframes, len(self._poses)
+        n = _room(count, _START)
+        e = _room(len(self._closures), 2 * _START)
+        begin, end, step, cov = zip(*self._closures, strict=True) if self._closures else ([], [], [], [])
+        identity = np.eye(3)
+        closures = Closures(
+            begin=_filled(begin, e, (), int),
+            end=_filled(end, e, (), int),
+            step=_filled(step, e, (3,)),
+            cov=_filled(cov, e, (3, 3), fill=identity),
+            valid=_filled(np.ones(len(begin)), e, (), bool),
+        )
+        return PoseGraph(
+            poses=_filled(self._poses, n, (3,)),
+            step=_filled(kept.step, n, (3,)),
+            cov_step=_filled(kept.cov_step, n, (3, 3), fill=identity),
+            valid=_filled(np.ones(count), n, (), bool),
+            closures=closures,
+        )
+
+    @property
+    def closures(self) -> int:
+        """Loops that are believed to be closed."""
+        return int((self._weight > SURE).sum())
+
+    @property
+    def keyframes(self) -> Float[np.ndarray, "N 3"]:
+        """Poses of the keyframes. m, m, rad."""
+        return self._poses
+
+    def trajectory(self) -> Float[np.ndarray, "T 3"]:
+        """The pose of the scanner at each scan so far. m, m, rad."""
+        owner, seen = np.concatenate(self._keyframe_of_scan), np.concatenate(self._seen_from_keyframe)
+        return _compose(self._poses[owner], seen)
+
+
+def slam(scans: Scan, odometry: Float[Array, "T 3"], **settings: Any) -> Slam:
+    """Run over a whole log.
+
+    Args:
+      scans: `T`, stacked.
+      odometry: poses of the scanner by the robot's odometry. m, m, rad.
+      **settings: as those of `Slam`.
+    """
+    done = Slam(**settings)
+    for i in range(0, scans.ranges.shape[0], CHUNK):
+        done.add(jax.tree.map(lambda x, i=i: x[i : i + CHUNK], scans), odometry[i : i + CHUNK])
+    return done
+
+
+_jit_track = jax.jit(track_chunk)
+_jit_close = jax.jit(close_loop)
+_jit_optimise = jax.jit(optimise)
+_jit_middles = jax.jit(jax.vmap(middle_of))
+
+
+def _room(count: int, least: int) -> int:
+    """The next power of two: each size is compiled once."""
+    return max(least, 1 << (count - 1).bit_length()) if count else least
+
+
+def _filled(values: Any, size: int, shape: tuple[int, ...], dtype: Any = float, *, fill: Any = 0) -> Array:
+    filled = np.empty((size, *shape), dtype)
+    filled[:] = fill
+    if len(values):
+        filled[: len(values)] = values
+    return jnp.asarray(filled)
+
+
+def _spread(order: np.ndarray) -> Iterator[int]:
+    """The first few that do not stand close together."""
+    taken: list[int] = []
+    for j in order.tolist():
+        if len(taken) == CANDIDATES:
+            return
+        if all(abs(j - k) > CANDIDATES_APART for k in taken):
+            taken.append(j)
+            yield j
+
+
+def _compose(pose: Any, step: Any) -> np.ndarray:
+    """As `frames.compose`, in float64 on the host, for one pose or many."""
+    pose, step = np.asarray(pose, float), np.asarray(step, float)
+    c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
+    x = pose[..., 0] + c * step[..., 0] - s * step[..., 1]
+    y = pose[..., 1] + s * step[..., 0] + c * step[..., 1]
+    return np.stack([x, y, _wrapped(pose[..., 2] + step[..., 2])], -1)
+
+
+def _between(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """As `frames.between`, in float64 on the host."""
+    c, s = np.cos(before[2]), np.sin(before[2])
+    dx, dy, turn = after - before
+    return np.array([c * dx + s * dy, -s * dx + c * dy, _wrapped(turn)])
+
+
+def _wrapped(angle: Any) -> Any:
+    return (angle + np.pi) % (2 * np.pi) - np.pi
