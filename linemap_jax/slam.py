@@ -112,7 +112,11 @@ class Slam:
         prior = np.diag([1 / 0.3**2, 1 / 0.3**2, 1 / 0.15**2])  # what odometry says at least, over one step
         middles = np.asarray(_jit_middles(said.surface))
         covs = np.asarray(
-            cov_of_registration(jnp.asarray(said.information, float), jnp.asarray(np.tile(prior, (len(middles), 1, 1))))
+            cov_of_registration(
+                jnp.asarray(said.information, float),
+                jnp.asarray(said.share, float),
+                jnp.asarray(np.tile(prior, (len(middles), 1, 1))),
+            )
         )
         owner, seen = np.zeros(len(middles), int), np.zeros((len(middles), 3))
         for i in range(len(middles)):
@@ -145,7 +149,9 @@ class Slam:
                 closure = self._compare(i, j, path[j])
                 if closure.believed:
                     cov = cov_of_registration(
-                        jnp.asarray(closure.information, float), jnp.asarray(_LEAST_INFORMATION)
+                        jnp.asarray(closure.information, float),
+                        jnp.asarray(closure.share, float),
+                        jnp.asarray(_LEAST_INFORMATION),
                     )
                     found.append((j, i, np.asarray(closure.step, float), np.asarray(cov)))
         self._closures += found
@@ -176,10 +182,9 @@ class Slam:
 
     def _optimise(self) -> None:
         """Let the graph settle."""
-        graph, weight = _jit_optimise(self.graph())
-        count, closures = len(self._poses), len(self._closures)
-        self._poses = np.asarray(graph.poses)[:count]
-        self._weight = np.asarray(weight)[:closures]
+        graph = _jit_optimise(self.graph())
+        self._poses = np.asarray(graph.poses)[: len(self._poses)]
+        self._weight = np.asarray(graph.closures.weight)[: len(self._closures)]
 
     def graph(self) -> PoseGraph:
         """Keyframes and closures, padded to powers of two."""
@@ -193,6 +198,7 @@ class Slam:
             end=_filled(end, e, (), int),
             step=_filled(step, e, (3,)),
             cov=_filled(cov, e, (3, 3), fill=identity),
+            weight=_filled(self._weight, e, ()),
             valid=_filled(np.ones(len(begin)), e, (), bool),
         )
         return PoseGraph(

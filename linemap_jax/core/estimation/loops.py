@@ -76,6 +76,11 @@ def joined(surfaces: Surface, poses: Float[Array, "S 3"], valid: Bool[Array, " S
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), moved)
 
 
+def thinned(surface: Surface) -> Surface:
+    """Every third point."""
+    return jax.tree.map(lambda x: x[::THINNING], surface)
+
+
 def close_loop(
     new: Surface,
     surfaces: Surface,
@@ -109,17 +114,18 @@ def close_loop(
 
     def far(_: None) -> Closure:
         prior = jnp.diag(jnp.stack([1 / drift**2, 1 / drift**2, 1 / turn_drift**2])) * 1e-3
-        starts, score = search(new, surface, guess, drift, turn_drift)
-        found = jax.vmap(lambda start: register(new, surface, start, prior, registration, iterations=20))(starts)
+        few = thinned(new)
+        starts, score = search(few, surface, guess, drift, turn_drift)
+        found = jax.vmap(lambda start: register(few, surface, start, prior, registration))(starts)
         share = jnp.where(score > 0.3, found.share, 0)
         best = jnp.argmax(share)
-        at = jax.tree.map(lambda x: x[best], found)
-        off = found.pose - at.pose
+        off = found.pose - found.pose[best]
         other = jnp.abs(wrap_angle(off[:, 2])) > settings.turned_apart
         other = other | (jnp.sum(off[:, :2] ** 2, -1) > settings.apart**2)
         runner_up = jnp.max(jnp.where(other, share, 0))
-        believed = (share[best] >= settings.share_far) & (runner_up <= settings.runner_up * share[best])
-        return Closure(at.pose, at.information, share[best], believed)
+        at = register(new, surface, found.pose[best], prior, registration)
+        believed = (at.share >= settings.share_far) & (runner_up <= settings.runner_up * share[best])
+        return Closure(*at, believed=believed)
 
     return jax.lax.cond(drift > settings.search_from, far, near, None)
 
@@ -147,18 +153,17 @@ def search(
     window = jnp.arange(-REACH, REACH + 1)
     turns = TURN * jnp.arange(-TURNS, TURNS + 1).astype(guess.dtype)
     moves = CELL * window.astype(guess.dtype)
-    thinned = jax.tree.map(lambda x: x[::THINNING], new)
     margin = SPAN + 2 * REACH
     padded = jnp.pad(grid, margin)
 
     def count(turn: Array) -> Array:
-        points = seen_from(thinned, guess.at[2].add(turn)).position
+        points = seen_from(new, guess.at[2].add(turn)).position
         cell = jnp.clip(jnp.floor(points / CELL).astype(jnp.int32), -SPAN - REACH, SPAN + REACH)
         corner = cell + SPAN + margin - REACH
         seen = jax.vmap(lambda c: jax.lax.dynamic_slice(padded, (c[0], c[1]), (window.size, window.size)))(corner)
-        return jnp.sum(jnp.where(thinned.valid[:, None, None], seen, 0), 0)
+        return jnp.sum(jnp.where(new.valid[:, None, None], seen, 0), 0)
 
-    score = jax.lax.map(count, turns) / jnp.maximum(jnp.sum(thinned.valid), 1).astype(guess.dtype)
+    score = jax.lax.map(count, turns) / jnp.maximum(jnp.sum(new.valid), 1).astype(guess.dtype)
     far = (moves[:, None] ** 2 + moves[None] ** 2) / drift**2 + (turns[:, None, None] / turn_drift) ** 2
     liked = jnp.where(far > 9, -1, score - 0.02 * far)  # of two that count alike, the nearer one
 

@@ -6,8 +6,8 @@ poses: then the chain alone has a nearly diagonal system, which is what conjugat
 they need about as many iterations as there are loops (Olson, Leonard and Teller 2006 give the parameters, not the
 solver).
 
-A closure may be wrong. Its weight falls with its squared residual (Geman and McClure), with a kernel that is wide at
-first and narrows (graduated non-convexity: Yang, Antonante, Tzoumas and Carlone 2020), so that a true closure far off
+A closure may be wrong. Its weight falls with its squared residual (Geman and McClure), with a kernel that is as wide at
+first as the farthest closure needs, and narrows (graduated non-convexity: Yang, Antonante, Tzoumas and Carlone 2020), so that a true closure far off
 is not given up before the graph has followed it.
 """
 
@@ -27,7 +27,7 @@ from linemap_jax.core.state import pytree
 KERNEL = 9.0
 """Squared residual, in sigmas, at which a closure has lost three quarters of its weight."""
 WIDEST_KERNEL = 1000.0
-"""The same in the first iteration."""
+"""The same in the first iteration, at most."""
 NARROWING = 0.4
 """Of the kernel, from one iteration to the next."""
 SURE = 0.5
@@ -40,6 +40,10 @@ class RegistrationError:
 
     point_weight: Number = 0.1
     """Of a point's information: neighbouring points share the faults of the surface and of their association."""
+    no_trust: Number = 0.4
+    """Where no more of the scan's points than this share agree, they say nothing."""
+    full_trust: Number = 0.7
+    """From this share on they say what they can."""
     distance_sigma: Number = 0.015
     """Of every step, m: faults that more points do not average away."""
     turn_sigma: Number = 0.005
@@ -54,6 +58,7 @@ class Closures:
     end: Int[Array, " E"]  # the newer
     step: Float[Array, "E 3"]  # pose of the newer, seen from the older. m, m, rad
     cov: Float[Array, "E 3 3"]
+    weight: Float[Array, " E"]  # from 0, not believed, to 1, which new ones begin with
     valid: Bool[Array, " E"]
 
 
@@ -69,16 +74,26 @@ class PoseGraph:
 
 
 def cov_of_registration(
-    information: Float[Array, "*s 3 3"], prior: Float[Array, "*s 3 3"], error: RegistrationError = RegistrationError()
+    information: Float[Array, "*s 3 3"],
+    share: Float[Array, "*s"],
+    prior: Float[Array, "*s 3 3"],
+    error: RegistrationError = RegistrationError(),
 ) -> Float[Array, "*s 3 3"]:
-    """Covariance of a step that registration has found, from the information of its points and that of its prior."""
+    """Covariance of a step that registration has found.
+
+    Args:
+      information: of its points, as if their errors were independent.
+      share: of the scan's points, those that agree.
+      prior: what is known of the step without them, as information.
+      error: how far they are believed.
+    """
+    trust = jnp.clip((share - error.no_trust) / (error.full_trust - error.no_trust), 0, 1)
+    weight = (error.point_weight * trust)[..., None, None]
     floor = jnp.stack([jnp.asarray(error.distance_sigma)] * 2 + [jnp.asarray(error.turn_sigma)]) ** 2
-    return inverse(error.point_weight * information + prior) + jnp.diag(floor).astype(information.dtype)
+    return inverse(weight * information + prior) + jnp.diag(floor).astype(information.dtype)
 
 
-def optimise(
-    graph: PoseGraph, *, iterations: int = 25, tolerance: float = 1e-4
-) -> tuple[PoseGraph, Float[Array, " E"]]:
+def optimise(graph: PoseGraph, *, iterations: int = 25, tolerance: float = 1e-4) -> PoseGraph:
     """The most likely poses.
 
     Args:
@@ -87,23 +102,29 @@ def optimise(
       tolerance: ends them when no pose moves by more, m and rad.
 
     Returns:
-      The graph with its poses, in the plane and not wrapped; and the weight of each closure, from 0 to 1.
+      The graph with these poses, whose angles are not wrapped, and with the weights that its closures have there.
     """
+
+    closures = graph.closures
+    far = jnp.where(closures.valid & (closures.weight > SURE), _squared_residuals(graph, graph.poses), 0)
+    widest = jnp.where(jnp.max(far) > KERNEL, WIDEST_KERNEL, KERNEL).astype(graph.poses.dtype)
+
+    def kernel_at(i: Array) -> Array:
+        return jnp.maximum(KERNEL, widest * NARROWING ** i.astype(widest.dtype))
 
     def iterate(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         i, poses, _ = state
-        kernel = jnp.maximum(KERNEL, WIDEST_KERNEL * NARROWING ** i.astype(poses.dtype))
-        move = _newton_step(graph, poses, _weights(graph, poses, kernel))
+        move = _newton_step(graph, poses, _weights(graph, poses, kernel_at(i)))
         return i + 1, poses + move, jnp.max(jnp.abs(move))
 
     def goes_on(state: tuple[Array, Array, Array]) -> Array:
         i, _, moved = state
-        narrow = WIDEST_KERNEL * NARROWING ** i.astype(moved.dtype) <= KERNEL
-        return (i < iterations) & ~(narrow & (moved < tolerance))
+        return (i < iterations) & ~((kernel_at(i) <= KERNEL) & (moved < tolerance))
 
     begin = (jnp.zeros((), jnp.int32), graph.poses, jnp.full((), jnp.inf, graph.poses.dtype))
     _, poses, _ = jax.lax.while_loop(goes_on, iterate, begin)
-    return dataclasses.replace(graph, poses=poses), _weights(graph, poses, jnp.asarray(KERNEL, poses.dtype))
+    weight = _weights(graph, poses, jnp.asarray(KERNEL, poses.dtype))
+    return dataclasses.replace(graph, poses=poses, closures=dataclasses.replace(closures, weight=weight))
 
 
 def _residuals(
@@ -127,8 +148,11 @@ def _residuals(
 
 
 def _weights(graph: PoseGraph, poses: Float[Array, "N 3"], kernel: Float[Array, ""]) -> Float[Array, " E"]:
-    off = _residuals(graph, poses)[1]
-    return jnp.where(graph.closures.valid, (kernel / (kernel + jnp.sum(off**2, -1))) ** 2, 0)
+    return jnp.where(graph.closures.valid, (kernel / (kernel + _squared_residuals(graph, poses))) ** 2, 0)
+
+
+def _squared_residuals(graph: PoseGraph, poses: Float[Array, "N 3"]) -> Float[Array, " E"]:
+    return jnp.sum(_residuals(graph, poses)[1] ** 2, -1)
 
 
 def _newton_step(graph: PoseGraph, poses: Float[Array, "N 3"], weight: Float[Array, " E"]) -> Float[Array, "N 3"]:
