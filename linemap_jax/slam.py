@@ -5,7 +5,7 @@ same place; where loops are closed, the graph is optimised. Memory grows with th
 """
 
 import dataclasses
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
@@ -16,13 +16,15 @@ from jaxtyping import Array, Float
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
+from linemap_jax.core.estimation.adjustment import Sightings, adjust, sightings_of_scan, with_error_of_poses
 from linemap_jax.core.estimation.loops import Closure, LoopSettings, close_loop
 from linemap_jax.core.estimation.odometry import OdometryNoise
 from linemap_jax.core.estimation.pose_graph import SURE, Closures, PoseGraph, cov_of_registration, optimise
 from linemap_jax.core.estimation.registration import RegistrationSettings
 from linemap_jax.core.estimation.surface import Surface, middle_of
 from linemap_jax.core.estimation.tracking import Track, Tracked, TrackingSettings, begin_track, track_chunk
-from linemap_jax.core.state import Scan, pad_stack
+from linemap_jax.core.settings import SensorNoise, Thresholds
+from linemap_jax.core.state import LineMap, Lines, Pose, Scan, pad_stack
 
 CHUNK = 64
 """Scans in one jitted call."""
@@ -55,6 +57,7 @@ class _Keyframes:
     cov_step: list[np.ndarray] = dataclasses.field(default_factory=list)
     middle: list[np.ndarray] = dataclasses.field(default_factory=list)  # [2] of what it sees, in its own frame
     surface: list[Surface] = dataclasses.field(default_factory=list)
+    scan: list[Scan] = dataclasses.field(default_factory=list)
 
 
 class Slam:
@@ -102,11 +105,11 @@ class Slam:
         said = jax.tree.map(lambda x: np.asarray(x)[:count], said)
         self.shares.append(said.share)
         begin = len(self._keyframes.step)
-        self._take(said)
+        self._take(said, jax.tree.map(np.asarray, scans))
         if self._close_loops(begin):
             self._optimise()
 
-    def _take(self, said: Tracked) -> None:
+    def _take(self, said: Tracked, scans: Scan) -> None:
         """Keep the keyframes of a chunk, and where its scans lie against them."""
         kept, odometry = self._keyframes, np.zeros(3)
         prior = np.diag([1 / 0.3**2, 1 / 0.3**2, 1 / 0.15**2])  # what odometry says at least, over one step
@@ -127,7 +130,8 @@ class Slam:
                 kept.cov_step.append(covs[i])
                 kept.middle.append(middles[i])
                 kept.surface.append(jax.tree.map(lambda x, i=i: x[i], said.surface))
-                pose = kept.tracked[-1] if first else _compose(self._poses[-1], kept.step[-1])
+                kept.scan.append(jax.tree.map(lambda x, i=i: x[i], scans))
+                pose = kept.tracked[-1] if first else compose(self._poses[-1], kept.step[-1])
                 self._poses = np.concatenate([self._poses, pose[None]])
             else:
                 seen[i] = said.step[i]
@@ -138,7 +142,7 @@ class Slam:
     def _close_loops(self, begin: int) -> bool:
         """Compare the keyframes from `begin` on with older ones; whether that closed a loop."""
         kept, poses = self._keyframes, self._poses
-        middles = np.array([_compose(pose, [*middle, 0])[:2] for pose, middle in zip(poses, kept.middle, strict=True)])
+        middles = np.array([compose(pose, [*middle, 0])[:2] for pose, middle in zip(poses, kept.middle, strict=True)])
         found = []
         for i in range(max(begin, NEWER + 1), len(poses)):
             path = self._shortest_paths(i, found)[: i - NEWER]
@@ -166,8 +170,8 @@ class Slam:
         valid = (around >= 0) & (around <= i - NEWER + BESIDE)
         around = np.clip(around, 0, len(poses) - 1)
         surfaces = jax.tree.map(lambda *x: np.stack(x), *(kept.surface[k] for k in around))
-        seen = np.array([_between(poses[j], poses[k]) for k in around]).astype(dtype)
-        guess = _between(poses[j], poses[i]).astype(dtype)
+        seen = np.array([between(poses[j], poses[k]) for k in around]).astype(dtype)
+        guess = between(poses[j], poses[i]).astype(dtype)
         return jax.device_get(self._close(kept.surface[i], surfaces, seen, valid, guess, np.asarray(path, dtype)))
 
     def _shortest_paths(self, i: int, found: list[Any]) -> np.ndarray:
@@ -186,11 +190,11 @@ class Slam:
         self._poses = np.asarray(graph.poses)[: len(self._poses)]
         self._weight = np.asarray(graph.closures.weight)[: len(self._closures)]
 
-    def graph(self) -> PoseGraph:
-        """Keyframes and closures, padded to powers of two."""
+    def graph(self, room: Callable[[int], int] | None = None) -> PoseGraph:
+        """Keyframes and closures, padded: to powers of two, or to what `room` gives for their number."""
         kept, count = self._keyframes, len(self._poses)
-        n = _room(count, _START)
-        e = _room(len(self._closures), 2 * _START)
+        n = (room or _room)(count)
+        e = (room or _room)(len(self._closures))
         begin, end, step, cov = zip(*self._closures, strict=True) if self._closures else ([], [], [], [])
         identity = np.eye(3)
         closures = Closures(
@@ -209,6 +213,57 @@ class Slam:
             closures=closures,
         )
 
+    def adjust(
+        self, line_map: LineMap, *, thresholds: Thresholds = Thresholds(), noise: SensorNoise = SensorNoise()
+    ) -> tuple[LineMap, Float[np.ndarray, "N 3 3"]]:
+        """Let poses and lines settle together; from then on the trajectory is that of the adjustment.
+
+        Args:
+          line_map: made from the scans at the poses of the trajectory.
+          thresholds: of extraction and matching.
+          noise: of the scanner.
+
+        Returns:
+          The map, whose covariances now hold what the poses are uncertain by, too; and the covariances of the
+          keyframes' poses.
+        """
+        count, dtype = len(self._poses), line_map.lines.offset.dtype
+        cov = np.diag(np.square([0.02, 0.02, 0.005]))
+        numbers, pieces = np.arange(count), []
+        for i in range(0, count, CHUNK):
+            scans = jax.tree.map(lambda *x: np.stack(x), *self._keyframes.scan[i : i + CHUNK])
+            poses = Pose(
+                mean=jnp.asarray(self._poses[i : i + CHUNK], dtype),
+                cov=jnp.asarray(np.tile(cov, (len(scans.ranges), 1, 1)), dtype),
+            )
+            piece = pad_stack((scans, poses, jnp.asarray(numbers[i : i + CHUNK])), CHUNK)
+            seen = _jit_sightings(*piece, line_map.lines, thresholds=thresholds, noise=noise)
+            pieces.append(jax.tree.map(lambda x, n=len(scans.ranges): np.asarray(x)[:n].reshape(-1, *x.shape[2:]), seen))
+        joint = jax.tree.map(lambda *x: np.concatenate(x), *pieces)
+        joint = jax.tree.map(lambda x: x[joint.valid], joint)
+        used = np.flatnonzero(np.asarray(line_map.lines.valid))
+        place = np.zeros(line_map.lines.valid.shape[0], int)
+        place[used] = np.arange(len(used))
+        joint = dataclasses.replace(joint, line=place[joint.line])
+        m, k = _tight(len(joint.line)), _tight(len(used))
+        wide = jax.tree.map(lambda x: np.asarray(x, float if x.dtype.kind == "f" else x.dtype), joint)
+        sightings = jax.tree.map(lambda x: _filled(x, m, x.shape[1:], x.dtype), wide)
+        sightings = dataclasses.replace(
+            sightings, cov=jnp.where(sightings.valid[:, None, None], sightings.cov, jnp.eye(2))
+        )
+        lines = jax.tree.map(lambda x: _filled(np.asarray(x)[used], k, x.shape[1:], _wide(x.dtype)), line_map.lines)
+        done = _jit_adjust(self.graph(_tight), lines, sightings)
+        self._poses = np.asarray(done.poses)[:count]
+        covs = np.asarray(done.cov_poses)[:count]
+        moved = jax.tree.map(
+            lambda old, new: jnp.asarray(_put(np.asarray(old), used, np.asarray(new)[: len(used)]), old.dtype),
+            line_map.lines,
+            done.lines,
+        )
+        seen = _put(np.zeros(place.shape, bool), used, np.asarray(done.seen)[: len(used)])
+        moved = dataclasses.replace(line_map, lines=moved)
+        return _jit_error_of_poses(moved, seen, self._poses, covs), covs
+
     @property
     def closures(self) -> int:
         """Loops that are believed to be closed."""
@@ -222,7 +277,7 @@ class Slam:
     def trajectory(self) -> Float[np.ndarray, "T 3"]:
         """The pose of the scanner at each scan so far. m, m, rad."""
         owner, seen = np.concatenate(self._keyframe_of_scan), np.concatenate(self._seen_from_keyframe)
-        return _compose(self._poses[owner], seen)
+        return compose(self._poses[owner], seen)
 
 
 def slam(scans: Scan, odometry: Float[Array, "T 3"], **settings: Any) -> Slam:
@@ -242,12 +297,39 @@ def slam(scans: Scan, odometry: Float[Array, "T 3"], **settings: Any) -> Slam:
 _jit_track = jax.jit(track_chunk)
 _jit_close = jax.jit(close_loop)
 _jit_optimise = jax.jit(optimise)
+_jit_adjust = jax.jit(adjust)
+_jit_error_of_poses = jax.jit(with_error_of_poses)
 _jit_middles = jax.jit(jax.vmap(middle_of))
 
 
-def _room(count: int, least: int) -> int:
+@jax.jit
+def _jit_sightings(
+    scans: Scan, poses: Pose, numbers: Array, lines: Lines, thresholds: Thresholds, noise: SensorNoise
+) -> Sightings:
+    def of_scan(x: tuple[Scan, Pose, Array]) -> Sightings:
+        return sightings_of_scan(*x[:2], lines, x[2], thresholds=thresholds, noise=noise)
+
+    return jax.lax.map(of_scan, (scans, poses, numbers))
+
+
+def _wide(dtype: Any) -> Any:
+    return float if np.dtype(dtype).kind == "f" else dtype
+
+
+def _put(old: np.ndarray, where: np.ndarray, new: np.ndarray) -> np.ndarray:
+    old = old.copy()
+    old[where] = new
+    return old
+
+
+def _room(count: int) -> int:
     """The next power of two: each size is compiled once."""
-    return max(least, 1 << (count - 1).bit_length()) if count else least
+    return max(_START, 1 << max(count - 1, 0).bit_length())
+
+
+def _tight(count: int) -> int:
+    """The next multiple of 128: time grows with the cube of it."""
+    return 128 * max(1, -(-count // 128))
 
 
 def _filled(values: Any, size: int, shape: tuple[int, ...], dtype: Any = float, *, fill: Any = 0) -> Array:
@@ -269,7 +351,7 @@ def _spread(order: np.ndarray) -> Iterator[int]:
             yield j
 
 
-def _compose(pose: Any, step: Any) -> np.ndarray:
+def compose(pose: Any, step: Any) -> np.ndarray:
     """As `frames.compose`, in float64 on the host, for one pose or many."""
     pose, step = np.asarray(pose, float), np.asarray(step, float)
     c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
@@ -278,7 +360,7 @@ def _compose(pose: Any, step: Any) -> np.ndarray:
     return np.stack([x, y, _wrapped(pose[..., 2] + step[..., 2])], -1)
 
 
-def _between(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+def between(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     """As `frames.between`, in float64 on the host."""
     c, s = np.cos(before[2]), np.sin(before[2])
     dx, dy, turn = after - before

@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import sys
-import time
 from collections.abc import Iterator
 from importlib import resources
 from pathlib import Path
@@ -11,16 +10,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from linemap_jax.cli.compilations import cache_folder
 from linemap_jax.cli.history import History
 from linemap_jax.cli.logs import SCANS_EXPLAINED, chunks_of_log, mount_of, opened, progress, tell_poses, warn
+from linemap_jax.cli.mapping import map_of_pieces
 from linemap_jax.cli.options import LogOptions, options_of_update
 from linemap_jax.cli.output import check_output, make_folder, say
 from linemap_jax.cli.rejections import Rejections
-from linemap_jax.cli.resume import START_CAPACITY, differences, map_to_resume
+from linemap_jax.cli.resume import differences, map_to_resume
 
 if TYPE_CHECKING:
-    from linemap_jax.core.state import LineMap, Report
+    from linemap_jax.core.state import LineMap, Pose, Report, Scan
     from linemap_jax.io.log import Log
 
 DEMO_NOISE = {"range_sigma": 0.015, "bearing_sigma": 0.0005, "pose_sigma": (0.01, 0.01, 0.002)}
@@ -72,8 +71,10 @@ class Build(LogOptions):
             settings["resumed_from"] = str(before.settings.get("log", self.resume_from))
         history = History(options["mount"]) if self.html else None
         with progress(log, quiet=self.quiet):
-            line_map, report, positions, seconds, interrupted = _map_of_log(
-                self, log, options, before.line_map if before else None, history
+            positions: list[tuple[float, float]] = []
+            pieces = _driven(self, log, history, positions)
+            line_map, report, seconds, interrupted = map_of_pieces(
+                pieces, options, before.line_map if before else None, history.add if history else None
             )
         warn(log, quiet=self.quiet)
         lost = sum(bool(status & Status.POSE_NOT_FINITE) for status in report.status.tolist())
@@ -121,49 +122,20 @@ class Demo:
             return build.run()
 
 
-def _map_of_log(
-    command: Build, log: "Log", options: dict[str, Any], before: "LineMap | None", history: History | None
-) -> tuple["LineMap", "Report", list[tuple[float, float]], list[tuple[float, int]], bool]:
-    """The map, the reports, the positions of the robot, the seconds and scans of each piece, reading included.
-
-    And whether somebody interrupted it: then the map is the one so far.
-    """
+def _driven(
+    command: Build, log: "Log", history: History | None, positions: list[tuple[float, float]]
+) -> Iterator[tuple["Scan", "Pose"]]:
+    """The log in pieces; the positions of the robot are kept on the way."""
     import numpy as np
 
-    from linemap_jax.build import CHUNK, COMPILER_OPTIONS, STATIC, build_chunks, join_reports, update_chunk
-    from linemap_jax.core.settings import Capacity
-    from linemap_jax.io.programs import kept_program
+    from linemap_jax.build import CHUNK
 
-    run = kept_program(update_chunk, cache_folder(), static_argnames=STATIC, compiler_options=COMPILER_OPTIONS)
-    start = Capacity(*START_CAPACITY)
-    positions, reports, seconds = [], [], []
-
-    def driven() -> Iterator[Any]:
-        for chunk in chunks_of_log(command, log, CHUNK):
-            positions.extend(map(tuple, np.asarray(chunk.poses.mean)[:, :2].tolist()))
-            if history is None:
-                yield chunk.scans, chunk.poses
-            else:
-                yield from history.pieces(chunk.scans, chunk.poses)
-
-    line_map, interrupted = None, False
-    started = time.perf_counter()
-    try:
-        for grown, report in build_chunks(
-            driven(), line_map=before, map_capacity=start, chunk=CHUNK, run=run, **options
-        ):
-            line_map = grown
-            reports.append(report)
-            if history is not None:
-                history.add(grown)
-            seconds.append((time.perf_counter() - started, report.status.shape[0]))
-            started = time.perf_counter()
-    except KeyboardInterrupt:
-        if line_map is None:
-            raise
-        interrupted = True
-    assert line_map is not None  # a log without a scan has been refused by its reader
-    return line_map, join_reports(reports), positions, seconds, interrupted
+    for chunk in chunks_of_log(command, log, CHUNK):
+        positions.extend(map(tuple, np.asarray(chunk.poses.mean)[:, :2].tolist()))
+        if history is None:
+            yield chunk.scans, chunk.poses
+        else:
+            yield from history.pieces(chunk.scans, chunk.poses)
 
 
 def _rejections(command: Build, log: "Log", options: dict[str, Any]) -> Rejections:

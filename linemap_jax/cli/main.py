@@ -17,12 +17,13 @@ from linemap_jax.cli.info import Info
 from linemap_jax.cli.merge import Merge
 from linemap_jax.cli.options import UsageError
 from linemap_jax.cli.simulate import Simulate
+from linemap_jax.cli.slam import Slam
 from linemap_jax.cli.trials import Trials
 from linemap_jax.cli.verify import Verify
 
 DESCRIPTION = """Maps of line segments and circles from 2D range scans, with covariances that can be believed.
 
-Maps: demo, build, export, merge, compare.
+Maps: demo, build, slam, export, merge, compare.
 
 Logs: info, extract, calibrate, config.
 
@@ -31,6 +32,7 @@ Laboratory: simulate, evaluate, trials, verify."""
 Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Build, tyro.conf.subcommand("build")]
+    | Annotated[Slam, tyro.conf.subcommand("slam")]
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Merge, tyro.conf.subcommand("merge")]
     | Annotated[Compare, tyro.conf.subcommand("compare")]

@@ -146,6 +146,36 @@ def corridor(key: Array, *, rooms: int = 3, dtype: Any = None) -> World:
     return dataclasses.replace(polygon(corners, Kind.ROOM), path=path)
 
 
+def ring(key: Array, *, boxes: int = 14, dtype: Any = None) -> World:
+    """A corridor that closes on itself around a block, 4 m wide, with boxes along its walls.
+
+    The path goes round anticlockwise, a lap and two thirds: 100 m.
+
+    Args:
+      key: decides the places, sizes and directions of the boxes.
+      boxes: how many.
+      dtype: of the world; jax's default unless given.
+    """
+    dtype = _float(dtype)
+    outer, inner = jnp.asarray([24.0, 14.0], dtype), jnp.asarray([16.0, 6.0], dtype)
+    center = jnp.zeros(2, dtype)
+    walls = [box(center, *outer, kind=Kind.ROOM), box(center, *inner)]
+    of_place, of_size = jax.random.split(key)
+    along = jax.random.uniform(of_place, (boxes,), dtype, -0.4, 0.4)
+    sizes = jax.random.uniform(of_size, (boxes, 3), dtype)
+    for i in range(boxes):
+        long = i % 2 == 0
+        side = 1 if i % 4 < 2 else -1
+        # Within a metre of the outer wall, clear of the path, which is two metres from it.
+        place = jnp.stack([along[i] * outer[0], side * (outer[1] / 2 - 0.6)])
+        if not long:
+            place = jnp.stack([side * (outer[0] / 2 - 0.6), along[i] * inner[1]])
+        width, depth = 0.4 + 0.5 * sizes[i, 0], 0.4 + 0.5 * sizes[i, 1]
+        walls.append(box(place, width, depth, sizes[i, 2] - 0.5))
+    way = jnp.asarray([[0, -5], [10, -5], [10, 5], [-10, 5], [-10, -5], [10, -5], [10, 5], [-10, 5]], dtype)
+    return dataclasses.replace(join(*walls), path=way)
+
+
 def changing_room(key: Array, *, scans: int, dtype: Any = None) -> World:
     """A room of 8 m by 6 m in which things come and go: the time is counted for a drive of so many scans.
 

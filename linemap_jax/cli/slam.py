@@ -1,0 +1,195 @@
+"""`linemap slam`: from raw odometry and scans to a map and a trajectory."""
+
+import dataclasses
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from linemap_jax.cli.logs import SCANS_EXPLAINED, chunks_of_log, mount_of, opened, progress, warn
+from linemap_jax.cli.mapping import map_of_pieces
+from linemap_jax.cli.options import LogOptions, UsageError, options_of_update
+from linemap_jax.cli.output import check_output, make_folder, say
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from linemap_jax.core.settings import Mount
+    from linemap_jax.core.state import LineMap, Pose, Scan
+    from linemap_jax.io.log import Log
+    from linemap_jax.slam import Slam as Slammed
+
+DOUBTFUL = 0.4
+"""Scans of which fewer points than this share agree with what was seen before are told of."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Slam(LogOptions):
+    """Build a map and a trajectory from a log with raw odometry: writes map.json, map.png and trajectory.tum."""
+
+    log: tyro.conf.Positional[Path]
+    """CARMEN log, plain or .gz; ROS 1 .bag; ROS 2 bag: its folder, .mcap or .db3."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="DIR")]
+    """Folder for the map and the trajectory; made if it is not there."""
+    trajectory_frame: Literal["laser", "base"] = "laser"
+    """Whose poses trajectory.tum holds: the laser's, or the robot's."""
+    json: bool = False
+    """Print the summary as JSON."""
+
+    def run(self) -> int:
+        """Track, close loops, map, adjust; and give the exit status."""
+        options: dict[str, Any] = options_of_update(self) | {"pose_error": "unknown"}
+        import jax
+
+        # The graph needs float64, whatever the scans come in.
+        jax.config.update("jax_enable_x64", True)
+        from linemap_jax.core.settings import Mount
+        from linemap_jax.io.map_file import write_map
+        from linemap_jax.io.plot import plot_map
+        from linemap_jax.io.tum import write_tum
+
+        files = [self.output / name for name in ("map.json", "map.png", "trajectory.tum")]
+        check_output(self.output, *files, overwrite=self.overwrite)
+        log = opened(self, self.log)
+        mount = mount_of(self, log, quiet=self.quiet)
+        with progress(log, quiet=self.quiet):
+            slammed, stamps, interrupted = _tracked(self, log, mount)
+        warn(log, quiet=self.quiet)
+        _tell_doubts(slammed, log, quiet=self.quiet)
+
+        say("the trajectory stands; mapping", quiet=self.quiet)
+        at_laser = options | {"mount": Mount()}
+        again = opened(self, self.log)
+        with progress(again, quiet=self.quiet):
+            mapped = map_of_pieces(_at_poses(self, again, slammed.trajectory()), at_laser)
+        line_map, _ = slammed.adjust(mapped.line_map, thresholds=options["thresholds"], noise=options["noise"])
+        interrupted |= mapped.interrupted
+        trajectory = slammed.trajectory()
+
+        make_folder(self.output)
+        settings = {
+            "log": self.log.name,
+            "preset": self.preset,
+            "pose_sigma": self.pose_sigma,
+            "slam": {"keyframes": len(slammed.keyframes), "loops": slammed.closures},
+            **{name: option for name, option in at_laser.items() if name != "segmentation"},
+        }
+        write_map(files[0], line_map, settings, overwrite=self.overwrite)
+        plot_map(files[1], line_map, trajectory[:, :2], title=self.log.name, overwrite=self.overwrite)
+        poses = trajectory if self.trajectory_frame == "laser" else _of_base(trajectory, mount)
+        write_tum(files[2], stamps, poses, overwrite=self.overwrite)
+        if interrupted:
+            print(f"linemap: interrupted; map and trajectory so far are in {self.output}", file=sys.stderr)
+            return 130
+        summary = _summary(self, slammed, line_map, trajectory, files)
+        print(json.dumps(summary, indent=2) if self.json else _in_words(summary))
+        return 0
+
+
+def _tracked(command: Slam, log: "Log", mount: "Mount") -> tuple["Slammed", "np.ndarray", bool]:
+    """The log run through, the time stamps of its scans, and whether somebody interrupted it."""
+    import numpy as np
+
+    from linemap_jax import slam
+
+    slammed, stamps, interrupted = slam.Slam(), [], False
+    on_robot = np.array([mount.x, mount.y, mount.theta], float)
+    laser = next(iter(log)).pose_frame == "laser"
+    try:
+        for chunk in chunks_of_log(command, log, slam.CHUNK):
+            odometry = np.asarray(chunk.poses.mean, float)
+            if not np.isfinite(odometry).all():
+                raise UsageError(
+                    f"{log.path}: has scans without odometry; --standstill does without, --poses takes it from a file"
+                )
+            slammed.add(chunk.scans, odometry if laser else slam.compose(odometry, on_robot))
+            stamps.append(chunk.timestamps)
+    except KeyboardInterrupt:
+        if not stamps:
+            raise
+        interrupted = True
+    return slammed, np.concatenate(stamps), interrupted
+
+
+def _at_poses(
+    command: LogOptions, log: "Log", trajectory: "np.ndarray", every: int = 1
+) -> Iterator[tuple["Scan", "Pose"]]:
+    """The scans of the log, as far as the trajectory goes, at its poses."""
+    import jax
+    import jax.numpy as jnp
+
+    from linemap_jax.build import CHUNK
+
+    begin = 0
+    for chunk in chunks_of_log(dataclasses.replace(command, every=command.every * every), log, CHUNK):
+        poses = trajectory[begin * every :: every][: len(chunk.timestamps)]
+        begin += len(poses)
+        if not len(poses):
+            return
+        scans, covs = jax.tree.map(lambda x, n=len(poses): x[:n], (chunk.scans, chunk.poses.cov))
+        yield scans, dataclasses.replace(chunk.poses, mean=jnp.asarray(poses, scans.ranges.dtype), cov=covs)
+
+
+def _of_base(trajectory: "np.ndarray", mount: "Mount") -> "np.ndarray":
+    """The poses of the robot that carries the laser."""
+    import numpy as np
+
+    from linemap_jax import slam
+
+    laser = np.array([mount.x, mount.y, mount.theta], float)
+    return slam.compose(trajectory, slam.between(laser, np.zeros(3)))
+
+
+def _tell_doubts(slammed: "Slammed", log: "Log", *, quiet: bool) -> None:
+    """Say where the trajectory rests on odometry."""
+    import numpy as np
+
+    share = np.concatenate(slammed.shares)[1:]
+    doubtful = int((share < DOUBTFUL).sum())
+    if doubtful:
+        say(
+            f"warning: {log.path}: of {doubtful} of {len(share) + 1} scans few points agree with what was seen before; "
+            "there the trajectory rests on odometry",
+            quiet=quiet,
+        )
+
+
+def _summary(
+    command: Slam, slammed: "Slammed", line_map: "LineMap", trajectory: "np.ndarray", files: list[Path]
+) -> dict[str, Any]:
+    """What `slam` says of its work."""
+    import numpy as np
+
+    from linemap_jax.build import CHUNK
+    from linemap_jax.core.settings import Mount
+    from linemap_jax.lab.evaluation import explained_share
+
+    seldom = -(-len(trajectory) // SCANS_EXPLAINED)
+    pieces = _at_poses(command, opened(command, command.log), trajectory, seldom)
+    driven = np.hypot(*np.diff(trajectory[:, :2], axis=0).T).sum()
+    return {
+        "log": str(command.log),
+        "scans": len(trajectory),
+        "keyframes": len(slammed.keyframes),
+        "loops": slammed.closures,
+        "driven_m": float(driven),
+        "lines": int(np.asarray(line_map.lines.valid).sum()),
+        "circles": int(np.asarray(line_map.circles.valid).sum()),
+        "explained": explained_share(line_map, pieces, Mount(), chunk=CHUNK),
+        **dict(zip(("map", "picture", "trajectory"), map(str, files), strict=True)),
+    }
+
+
+def _in_words(summary: dict[str, Any]) -> str:
+    return (
+        f"{summary['scans']} scans over {summary['driven_m']:.0f} m -> {summary['keyframes']} keyframes, "
+        f"{summary['loops']} loops closed\n"
+        f"{summary['lines']} lines, {summary['circles']} circles; {summary['explained']:.1%} of the returns under 20 m "
+        "lie within 10 cm of them\n"
+        f"map:        {summary['map']}\n"
+        f"picture:    {summary['picture']}\n"
+        f"trajectory: {summary['trajectory']}"
+    )
