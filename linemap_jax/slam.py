@@ -2,20 +2,22 @@
 
 Scans are tracked in chunks of one size. After each chunk its keyframes are compared with older ones that look at the
 same place; where loops are closed, the graph is optimised. Memory grows with the number of keyframes, not of scans.
+Scans are tracked in their own precision; the graph is float64 whatever jax is set to.
 """
 
 import dataclasses
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float, Int
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
+from linemap_jax.build import build
 from linemap_jax.core.estimation.adjustment import Sightings, adjust, sightings_of_scan, with_error_of_poses
 from linemap_jax.core.estimation.loops import Closure, LoopSettings, close_loop
 from linemap_jax.core.estimation.odometry import OdometryNoise
@@ -43,6 +45,12 @@ FARTHEST = 12.0
 """m. The same, at most."""
 CLOSED = 0.3
 """m. A closure counts as a path of this length."""
+
+SIGMA_NEXT = (0.02, 0.02, 0.005)
+"""m, m, rad. How far the pose of a scan may be off against its neighbours', when lines are matched."""
+
+SIGMA_SCAN = (0.01, 0.01, 0.003)
+"""m, m, rad. By how much the registration of a single scan errs."""
 
 _START = 512  # keyframes that there is room for at first
 _LEAST_INFORMATION = np.diag([1.0, 1.0, 10.0])  # of a closure, beside its points: 1 m, 0.3 rad
@@ -87,20 +95,20 @@ class Slam:
         self._keyframe_of_scan: list[np.ndarray] = []
         self._seen_from_keyframe: list[np.ndarray] = []
         self.shares: list[np.ndarray] = []
+        self.unit_variance = 1.0
 
-    def add(self, scans: Scan, odometry: Float[Array, "T 3"]) -> None:
+    def add(self, scans: Scan, odometry: ArrayLike) -> None:
         """Go on by some scans.
 
         Args:
           scans: at most `CHUNK`, stacked.
-          odometry: poses of the scanner by the robot's odometry. m, m, rad.
+          odometry: poses of the scanner by the robot's odometry. m, m, rad. Shape `[T, 3]`.
         """
-        count = scans.ranges.shape[0]
+        count, poses = scans.ranges.shape[0], jnp.asarray(odometry, scans.ranges.dtype)
         if self._state is None:
-            self._state = begin_track(odometry[0], jax.tree.map(lambda x: x[0], scans))
-        odometry = jnp.asarray(odometry, scans.ranges.dtype)
+            self._state = begin_track(poses[0], jax.tree.map(lambda x: x[0], scans))
         self._state, said = self._track(
-            self._state, pad_stack(scans, CHUNK), pad_stack(odometry, CHUNK), jnp.arange(CHUNK) < count
+            self._state, pad_stack(scans, CHUNK), pad_stack(poses, CHUNK), jnp.arange(CHUNK) < count
         )
         said = jax.tree.map(lambda x: np.asarray(x)[:count], said)
         self.shares.append(said.share)
@@ -111,22 +119,16 @@ class Slam:
 
     def _take(self, said: Tracked, scans: Scan) -> None:
         """Keep the keyframes of a chunk, and where its scans lie against them."""
-        kept, odometry = self._keyframes, np.zeros(3)
+        kept = self._keyframes
         prior = np.diag([1 / 0.3**2, 1 / 0.3**2, 1 / 0.15**2])  # what odometry says at least, over one step
         middles = np.asarray(_jit_middles(said.surface))
-        covs = np.asarray(
-            cov_of_registration(
-                jnp.asarray(said.information, float),
-                jnp.asarray(said.share, float),
-                jnp.asarray(np.tile(prior, (len(middles), 1, 1))),
-            )
-        )
+        covs = _cov_of_registration(said.information, said.share, np.tile(prior, (len(middles), 1, 1)))
         owner, seen = np.zeros(len(middles), int), np.zeros((len(middles), 3))
         for i in range(len(middles)):
             if said.is_keyframe[i]:
                 first = not kept.step
-                kept.tracked.append(said.pose[i].astype(float))
-                kept.step.append(np.zeros(3) if first else said.step[i].astype(float))
+                kept.tracked.append(np.asarray(said.pose[i], float))
+                kept.step.append(np.zeros(3) if first else np.asarray(said.step[i], float))
                 kept.cov_step.append(covs[i])
                 kept.middle.append(middles[i])
                 kept.surface.append(jax.tree.map(lambda x, i=i: x[i], said.surface))
@@ -152,12 +154,8 @@ class Slam:
             for j in _spread(np.argsort(np.where(near, apart, np.inf))[: near.sum()]):
                 closure = self._compare(i, j, path[j])
                 if closure.believed:
-                    cov = cov_of_registration(
-                        jnp.asarray(closure.information, float),
-                        jnp.asarray(closure.share, float),
-                        jnp.asarray(_LEAST_INFORMATION),
-                    )
-                    found.append((j, i, np.asarray(closure.step, float), np.asarray(cov)))
+                    cov = _cov_of_registration(closure.information, closure.share, _LEAST_INFORMATION)
+                    found.append((j, i, np.asarray(closure.step, float), cov))
         self._closures += found
         self._weight = np.concatenate([self._weight, np.ones(len(found))])
         return bool(found)
@@ -186,7 +184,8 @@ class Slam:
 
     def _optimise(self) -> None:
         """Let the graph settle."""
-        graph = _jit_optimise(self.graph())
+        with jax.enable_x64(True):
+            graph = _jit_optimise(self.graph())
         self._poses = np.asarray(graph.poses)[: len(self._poses)]
         self._weight = np.asarray(graph.closures.weight)[: len(self._closures)]
 
@@ -228,32 +227,37 @@ class Slam:
           keyframes' poses.
         """
         count, dtype = len(self._poses), line_map.lines.offset.dtype
-        cov = np.diag(np.square([0.02, 0.02, 0.005]))
+        cov = np.diag(np.square(SIGMA_NEXT))
         numbers, pieces = np.arange(count), []
         for i in range(0, count, CHUNK):
             scans = jax.tree.map(lambda *x: np.stack(x), *self._keyframes.scan[i : i + CHUNK])
+            size = len(scans.ranges)
             poses = Pose(
                 mean=jnp.asarray(self._poses[i : i + CHUNK], dtype),
-                cov=jnp.asarray(np.tile(cov, (len(scans.ranges), 1, 1)), dtype),
+                cov=jnp.asarray(np.tile(cov, (size, 1, 1)), dtype),
             )
             piece = pad_stack((scans, poses, jnp.asarray(numbers[i : i + CHUNK])), CHUNK)
             seen = _jit_sightings(*piece, line_map.lines, thresholds=thresholds, noise=noise)
-            pieces.append(jax.tree.map(lambda x, n=len(scans.ranges): np.asarray(x)[:n].reshape(-1, *x.shape[2:]), seen))
-        joint = jax.tree.map(lambda *x: np.concatenate(x), *pieces)
-        joint = jax.tree.map(lambda x: x[joint.valid], joint)
+            pieces.append(jax.tree.map(partial(_flat, size), seen))
+        valid = np.concatenate([piece.valid for piece in pieces])
+        seen = jax.tree.map(lambda *x: np.concatenate(x)[valid], *pieces)
         used = np.flatnonzero(np.asarray(line_map.lines.valid))
         place = np.zeros(line_map.lines.valid.shape[0], int)
         place[used] = np.arange(len(used))
-        joint = dataclasses.replace(joint, line=place[joint.line])
-        m, k = _tight(len(joint.line)), _tight(len(used))
-        wide = jax.tree.map(lambda x: np.asarray(x, float if x.dtype.kind == "f" else x.dtype), joint)
-        sightings = jax.tree.map(lambda x: _filled(x, m, x.shape[1:], x.dtype), wide)
-        sightings = dataclasses.replace(
-            sightings, cov=jnp.where(sightings.valid[:, None, None], sightings.cov, jnp.eye(2))
-        )
-        lines = jax.tree.map(lambda x: _filled(np.asarray(x)[used], k, x.shape[1:], _wide(x.dtype)), line_map.lines)
-        done = _jit_adjust(self.graph(_tight), lines, sightings)
+        m, k = _tight(valid.sum()), _tight(len(used))
+        with jax.enable_x64(True):
+            sightings = Sightings(
+                keyframe=_filled(seen.keyframe, m, (), int),
+                line=_filled(place[seen.line], m, (), int),
+                anchor=_filled(seen.anchor, m, (2,)),
+                angle=_filled(seen.angle, m, ()),
+                cov=_filled(seen.cov, m, (2, 2), fill=np.eye(2)),
+                valid=_filled(seen.valid, m, (), bool),
+            )
+            lines = jax.tree.map(lambda x: _filled(np.asarray(x)[used], k, x.shape[1:], _wide(x.dtype)), line_map.lines)
+            done = _jit_adjust(self.graph(_tight), lines, sightings)
         self._poses = np.asarray(done.poses)[:count]
+        self.unit_variance = float(done.unit_variance)
         covs = np.asarray(done.cov_poses)[:count]
         moved = jax.tree.map(
             lambda old, new: jnp.asarray(_put(np.asarray(old), used, np.asarray(new)[: len(used)]), old.dtype),
@@ -262,7 +266,8 @@ class Slam:
         )
         seen = _put(np.zeros(place.shape, bool), used, np.asarray(done.seen)[: len(used)])
         moved = dataclasses.replace(line_map, lines=moved)
-        return _jit_error_of_poses(moved, seen, self._poses, covs), covs
+        with jax.enable_x64(True):
+            return _jit_error_of_poses(moved, seen, self._poses, covs), covs
 
     @property
     def closures(self) -> int:
@@ -274,30 +279,77 @@ class Slam:
         """Poses of the keyframes. m, m, rad."""
         return self._poses
 
+    @property
+    def scan_of_keyframe(self) -> Int[np.ndarray, " N"]:
+        """Number of the scan that each keyframe is."""
+        return np.unique(np.concatenate(self._keyframe_of_scan), return_index=True)[1]
+
     def trajectory(self) -> Float[np.ndarray, "T 3"]:
         """The pose of the scanner at each scan so far. m, m, rad."""
         owner, seen = np.concatenate(self._keyframe_of_scan), np.concatenate(self._seen_from_keyframe)
         return compose(self._poses[owner], seen)
 
+    def cov_trajectory(self, cov_keyframes: Float[np.ndarray, "N 3 3"]) -> Float[np.ndarray, "T 3 3"]:
+        """Covariances of these, from those of the keyframes; m^2, m rad, rad^2.
 
-def slam(scans: Scan, odometry: Float[Array, "T 3"], **settings: Any) -> Slam:
-    """Run over a whole log.
+        A scan between two keyframes errs as the one before it, and by its own registration.
+        """
+        owner, seen = np.concatenate(self._keyframe_of_scan), np.concatenate(self._seen_from_keyframe)
+        theta = self._poses[owner, 2]
+        jac = np.tile(np.eye(3), (len(owner), 1, 1))
+        jac[:, 0, 2] = -np.sin(theta) * seen[:, 0] - np.cos(theta) * seen[:, 1]
+        jac[:, 1, 2] = np.cos(theta) * seen[:, 0] - np.sin(theta) * seen[:, 1]
+        between_keyframes = (seen != 0).any(1)[:, None, None]
+        own = between_keyframes * np.diag(np.square(SIGMA_SCAN))
+        return jac @ cov_keyframes[owner] @ np.swapaxes(jac, 1, 2) + own
+
+
+class Slammed(NamedTuple):
+    """A log whose poses were not known."""
+
+    line_map: LineMap
+    trajectory: Float[np.ndarray, "T 3"]  # of the scanner at each scan. m, m, rad
+    cov: Float[np.ndarray, "T 3 3"]  # of these
+    state: Slam
+
+
+def slam(
+    scans: Scan,
+    odometry: ArrayLike,
+    *,
+    thresholds: Thresholds = Thresholds(),
+    noise: SensorNoise = SensorNoise(),
+    **settings: Any,
+) -> Slammed:
+    """Map and trajectory of a whole log.
 
     Args:
       scans: `T`, stacked.
-      odometry: poses of the scanner by the robot's odometry. m, m, rad.
-      **settings: as those of `Slam`.
+      odometry: poses of the scanner by the robot's odometry. m, m, rad. Shape `[T, 3]`.
+      thresholds: of the map.
+      noise: of the scanner.
+      **settings: those of `Slam`.
     """
-    done = Slam(**settings)
-    for i in range(0, scans.ranges.shape[0], CHUNK):
-        done.add(jax.tree.map(lambda x, i=i: x[i : i + CHUNK], scans), odometry[i : i + CHUNK])
-    return done
+    state, count, places = Slam(**settings), scans.ranges.shape[0], np.asarray(odometry)
+    for i in range(0, count, CHUNK):
+        state.add(_part(scans, i), places[i : i + CHUNK])
+    dtype = scans.ranges.dtype
+    cov = jnp.asarray(np.tile(np.diag(np.square(SIGMA_NEXT)), (count, 1, 1)), dtype)
+    poses = Pose(mean=jnp.asarray(state.trajectory(), dtype), cov=cov)
+    line_map, _ = build(scans, poses, thresholds=thresholds, noise=noise, pose_error="unknown")
+    line_map, cov_keyframes = state.adjust(line_map, thresholds=thresholds, noise=noise)
+    return Slammed(line_map, state.trajectory(), state.cov_trajectory(cov_keyframes), state)
+
+
+def _part(scans: Scan, begin: int) -> Scan:
+    return jax.tree.map(lambda x: np.asarray(x)[begin : begin + CHUNK], scans)
 
 
 _jit_track = jax.jit(track_chunk)
 _jit_close = jax.jit(close_loop)
 _jit_optimise = jax.jit(optimise)
 _jit_adjust = jax.jit(adjust)
+_jit_cov = jax.jit(cov_of_registration)
 _jit_error_of_poses = jax.jit(with_error_of_poses)
 _jit_middles = jax.jit(jax.vmap(middle_of))
 
@@ -310,6 +362,17 @@ def _jit_sightings(
         return sightings_of_scan(*x[:2], lines, x[2], thresholds=thresholds, noise=noise)
 
     return jax.lax.map(of_scan, (scans, poses, numbers))
+
+
+def _cov_of_registration(information: Any, share: Any, prior: np.ndarray) -> np.ndarray:
+    """In float64, on NumPy arrays."""
+    with jax.enable_x64(True):
+        return np.asarray(_jit_cov(*(np.asarray(x, float) for x in (information, share, prior))))
+
+
+def _flat(count: int, stacked: Array) -> np.ndarray:
+    """The first few items of a stack, one after the other."""
+    return np.asarray(stacked)[:count].reshape(-1, *stacked.shape[2:])
 
 
 def _wide(dtype: Any) -> Any:

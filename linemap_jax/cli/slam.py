@@ -4,6 +4,7 @@ import dataclasses
 import json
 import sys
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -42,10 +43,6 @@ class Slam(LogOptions):
     def run(self) -> int:
         """Track, close loops, map, adjust; and give the exit status."""
         options: dict[str, Any] = options_of_update(self) | {"pose_error": "unknown"}
-        import jax
-
-        # The graph needs float64, whatever the scans come in.
-        jax.config.update("jax_enable_x64", True)
         from linemap_jax.core.settings import Mount
         from linemap_jax.io.map_file import write_map
         from linemap_jax.io.plot import plot_map
@@ -129,8 +126,12 @@ def _at_poses(
         begin += len(poses)
         if not len(poses):
             return
-        scans, covs = jax.tree.map(lambda x, n=len(poses): x[:n], (chunk.scans, chunk.poses.cov))
-        yield scans, dataclasses.replace(chunk.poses, mean=jnp.asarray(poses, scans.ranges.dtype), cov=covs)
+        scans, cov = jax.tree.map(partial(_first, len(poses)), (chunk.scans, chunk.poses.cov))
+        yield scans, dataclasses.replace(chunk.poses, mean=jnp.asarray(poses, scans.ranges.dtype), cov=cov)
+
+
+def _first(count: int, x: Any) -> Any:
+    return x[:count]
 
 
 def _of_base(trajectory: "np.ndarray", mount: "Mount") -> "np.ndarray":

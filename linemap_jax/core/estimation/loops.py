@@ -6,6 +6,7 @@ the points of the newer one are counted on it. The best of them are registered, 
 is believed if no other place agrees nearly as well: corridors look alike wherever one stands.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import jax
@@ -69,11 +70,12 @@ class Closure(NamedTuple):
 
 def joined(surfaces: Surface, poses: Float[Array, "S 3"], valid: Bool[Array, " S"]) -> Surface:
     """Several surfaces in one frame, that in which the poses are given. `[S, M]` in, `[S * M]` out."""
-    moved = jax.vmap(seen_from)(surfaces, poses)
-    moved = Surface(
-        position=moved.position, normal=moved.normal, flat=moved.flat, valid=moved.valid & valid[:, None]
-    )
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), moved)
+
+    def moved(surface: Surface, pose: Array, is_there: Array) -> Surface:
+        surface = seen_from(surface, pose)
+        return dataclasses.replace(surface, valid=surface.valid & is_there)
+
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), jax.vmap(moved)(surfaces, poses, valid))
 
 
 def thinned(surface: Surface) -> Surface:
@@ -119,7 +121,7 @@ def close_loop(
         found = jax.vmap(lambda start: register(few, surface, start, prior, registration))(starts)
         share = jnp.where(score > 0.3, found.share, 0)
         best = jnp.argmax(share)
-        off = found.pose - found.pose[best]
+        off = found.pose - found.pose[best][None]
         other = jnp.abs(wrap_angle(off[:, 2])) > settings.turned_apart
         other = other | (jnp.sum(off[:, :2] ** 2, -1) > settings.apart**2)
         runner_up = jnp.max(jnp.where(other, share, 0))
@@ -164,14 +166,15 @@ def search(
         return jnp.sum(jnp.where(new.valid[:, None, None], seen, 0), 0)
 
     score = jax.lax.map(count, turns) / jnp.maximum(jnp.sum(new.valid), 1).astype(guess.dtype)
-    far = (moves[:, None] ** 2 + moves[None] ** 2) / drift**2 + (turns[:, None, None] / turn_drift) ** 2
-    liked = jnp.where(far > 9, -1, score - 0.02 * far)  # of two that count alike, the nearer one
+    far = (moves[None, :, None] ** 2 + moves[None, None] ** 2) / drift**2 + (turns[:, None, None] / turn_drift) ** 2
+    near: Array = score - 0.02 * far
+    liked = jnp.where(far > 9, jnp.full_like(near, -1), near)  # of two that count alike, the nearer one
 
     def pick(liked: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
         best = jnp.unravel_index(jnp.argmax(liked), liked.shape)
         pose = guess + jnp.stack([moves[best[1]], moves[best[2]], turns[best[0]]])
         away = (jnp.abs(window - window[best[1]])[:, None] > 3) | (jnp.abs(window - window[best[2]])[None] > 3)
-        away = away | (jnp.abs(jnp.arange(turns.size) - best[0]) > 2)[:, None, None]
+        away = away[None] | (jnp.abs(jnp.arange(turns.size) - best[0]) > 2)[:, None, None]
         return jnp.where(away, liked, -2), (pose, score[best])
 
     return jax.lax.scan(pick, liked, None, length=HYPOTHESES)[1]

@@ -6,9 +6,9 @@ poses: then the chain alone has a nearly diagonal system, which is what conjugat
 they need about as many iterations as there are loops (Olson, Leonard and Teller 2006 give the parameters, not the
 solver).
 
-A closure may be wrong. Its weight falls with its squared residual (Geman and McClure), with a kernel that is as wide at
-first as the farthest closure needs, and narrows (graduated non-convexity: Yang, Antonante, Tzoumas and Carlone 2020), so that a true closure far off
-is not given up before the graph has followed it.
+A closure may be wrong. Its weight falls with its squared residual (Geman and McClure), with a kernel that is wide at
+first where a new closure is far off, and narrows (graduated non-convexity: Yang, Antonante, Tzoumas and Carlone 2020),
+so that a true closure far off is not given up before the graph has followed it.
 """
 
 import dataclasses
@@ -90,7 +90,9 @@ def cov_of_registration(
     trust = jnp.clip((share - error.no_trust) / (error.full_trust - error.no_trust), 0, 1)
     weight = (error.point_weight * trust)[..., None, None]
     floor = jnp.stack([jnp.asarray(error.distance_sigma)] * 2 + [jnp.asarray(error.turn_sigma)]) ** 2
-    return inverse(weight * information + prior) + jnp.diag(floor).astype(information.dtype)
+    return inverse(weight * information + prior) + jnp.broadcast_to(
+        jnp.diag(floor).astype(information.dtype), information.shape
+    )
 
 
 def optimise(graph: PoseGraph, *, iterations: int = 25, tolerance: float = 1e-4) -> PoseGraph:
@@ -104,7 +106,6 @@ def optimise(graph: PoseGraph, *, iterations: int = 25, tolerance: float = 1e-4)
     Returns:
       The graph with these poses, whose angles are not wrapped, and with the weights that its closures have there.
     """
-
     closures = graph.closures
     far = jnp.where(closures.valid & (closures.weight > SURE), _squared_residuals(graph, graph.poses), 0)
     widest = jnp.where(jnp.max(far) > KERNEL, WIDEST_KERNEL, KERNEL).astype(graph.poses.dtype)
@@ -127,9 +128,7 @@ def optimise(graph: PoseGraph, *, iterations: int = 25, tolerance: float = 1e-4)
     return dataclasses.replace(graph, poses=poses, closures=dataclasses.replace(closures, weight=weight))
 
 
-def _residuals(
-    graph: PoseGraph, poses: Float[Array, "N 3"]
-) -> tuple[Float[Array, "N 3"], Float[Array, "E 3"]]:
+def _residuals(graph: PoseGraph, poses: Float[Array, "N 3"]) -> tuple[Float[Array, "N 3"], Float[Array, "E 3"]]:
     """What the poses lack of each step of the chain and of each closure, in units of their sigmas."""
     closures = graph.closures
     before = jnp.concatenate([poses[:1], poses[:-1]])
@@ -177,19 +176,25 @@ def _newton_step(graph: PoseGraph, poses: Float[Array, "N 3"], weight: Float[Arr
     cov = propagate(turned, graph.cov_step)
     first = (jnp.arange(poses.shape[0]) == 0)[:, None]
 
-    right = jnp.where(first, 0, -backward(residuals)[0])
-    change, _ = cg(
-        lambda x: jnp.where(first, x, system(jnp.where(first, 0, x))),
+    pull: Array = backward(residuals)[0]
+    right = jnp.where(first, zero, -pull)
+
+    def held(x: Array) -> Array:
+        free: Array = jnp.where(first, zero, x)
+        return jnp.where(first, x, system(free))
+
+    change: Array = cg(
+        held,
         right,
         tol=1e-5,
         maxiter=300,
         M=partial(_preconditioned, cov, first),
-    )
-    return jnp.cumsum(jnp.where(first, 0, change), 0)
+    )[0]
+    moves: Array = jnp.where(first, zero, change)
+    return jnp.cumsum(moves, 0)
 
 
 def _preconditioned(
     cov: Float[Array, "N 3 3"], first: Bool[Array, "N 1"], residual: Float[Array, "N 3"]
 ) -> Float[Array, "N 3"]:
     return jnp.where(first, residual, apply(cov, residual))
-

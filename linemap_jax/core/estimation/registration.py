@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from linemap_jax.core.estimation.surface import Surface, seen_from
 from linemap_jax.core.frames import dot, perp, wrap_angle
-from linemap_jax.core.propagation import apply
+from linemap_jax.core.propagation import apply, inverse
 from linemap_jax.core.settings import Number
 from linemap_jax.core.state import pytree
 
@@ -75,7 +75,7 @@ def register(
         information, pull, share = _pull(new, surface, at.pose, gate, settings)
         off = guess - at.pose
         off = off.at[2].set(wrap_angle(off[2]))
-        step = jnp.linalg.solve(information + prior, pull + apply(prior, off))
+        step = apply(inverse(information + prior), pull + apply(prior, off))
         return i + 1, Registration(at.pose + step, information, share), jnp.max(jnp.abs(step))
 
     def goes_on(state: tuple[Array, Registration, Array]) -> Array:
@@ -99,7 +99,7 @@ def _pull(
     one_wall = dot(here.normal, normal) > jnp.cos(settings.flat_angle)
     used = new.valid & surface.valid[neighbour] & (dot(off, off) < gate**2) & (one_wall | ~(flat & new.flat))
 
-    lever = perp(here.position - pose[:2])
+    lever = perp(here.position - pose[None, :2])
     information, pull, distance = jnp.zeros((3, 3), pose.dtype), jnp.zeros(3, pose.dtype), []
     for direction, weight in (
         (normal, jnp.where(flat, 1, settings.weight_of_lone)),
@@ -116,9 +116,7 @@ def _pull(
     return information, pull, jnp.sum(agrees) / jnp.maximum(jnp.sum(new.valid), 1).astype(pose.dtype)
 
 
-def nearest(
-    points: Float[Array, "M 2"], others: Float[Array, "K 2"], valid: Bool[Array, " K"]
-) -> Int[Array, " M"]:
+def nearest(points: Float[Array, "M 2"], others: Float[Array, "K 2"], valid: Bool[Array, " K"]) -> Int[Array, " M"]:
     """The nearest of the others for each point; any, where none is valid.
 
     In float32, where the squared distances of two are equal but for their last bits, either of them. The bits of a

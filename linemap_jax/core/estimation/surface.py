@@ -51,9 +51,9 @@ def surface_of_scan(scan: Scan, points: int = POINTS) -> Surface:
     step = jnp.stack([step for step, _ in steps])
     beside = jnp.stack([beside for _, beside in steps])
     count = jnp.sum(beside, 0)
-    share = beside / jnp.maximum(count, 1).astype(ranges.dtype)
+    share = beside / jnp.maximum(count, 1).astype(ranges.dtype)[None]
     mean = jnp.sum(share[..., None] * step, 0)
-    x, y = jnp.moveaxis(step - mean, -1, 0)
+    x, y = jnp.moveaxis(step - mean[None], -1, 0)
     xx, xy, yy = (jnp.sum(share * product, 0) for product in (x * x, x * y, y * y))
     middle, half = (xx + yy) / 2, safe_sqrt((xx - yy) ** 2 / 4 + xy**2)
     normal = perp(unit(jnp.arctan2(2 * xy, xx - yy) / 2))
@@ -69,7 +69,7 @@ def seen_from(surface: Surface, pose: Float[Array, "3"]) -> Surface:
     """A surface in the frame of `pose`, as it is in the frame in which the pose is given. m, m, rad."""
     turned = jnp.stack([unit(pose[2]), perp(unit(pose[2]))], -1)
     return dataclasses.replace(
-        surface, position=pose[:2] + surface.position @ turned.T, normal=surface.normal @ turned.T
+        surface, position=pose[None, :2] + surface.position @ turned.T, normal=surface.normal @ turned.T
     )
 
 

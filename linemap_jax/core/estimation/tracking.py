@@ -111,7 +111,7 @@ def track(
 
     def try_others(first: Registration) -> Registration:
         sign = jnp.asarray([[-1.0, -1.0, 1.0], [0.0, 0.0, 1.0]], counted.dtype)
-        others = jnp.concatenate([sign * counted, state.step.at[2].set(counted[2])[None]])
+        others: Array = jnp.concatenate([sign * counted[None], state.step.at[2].set(counted[2])[None]])
         found = jax.vmap(from_guess, (0, None))(others, prior / 4)
         found = jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), first, found)
         best = jnp.argmax(found.share.at[1:].add(-settings.margin))
@@ -119,9 +119,9 @@ def track(
 
     first = from_guess(counted, prior)
     doubtful = (state.count > 0) & (first.share < settings.doubtful_share)
-    found = jax.lax.cond(doubtful, try_others, lambda first: first, first)
+    found: Registration = jax.lax.cond(doubtful, try_others, lambda first: first, first)
 
-    here = jnp.where(state.count > 0, found.pose, compose(last, counted))
+    here: Array = jnp.where(state.count > 0, found.pose, compose(last, counted))
     pose = compose(origin, here)
     step = between(state.keyframe, pose)
     turned = jnp.abs(step[2]) > settings.keyframe_turn
@@ -162,9 +162,7 @@ def _turned(angle: Float[Array, ""]) -> Float[Array, "3 3"]:
     return jnp.eye(3, dtype=angle.dtype).at[:2, :2].set(jnp.stack([jnp.stack([c, -s]), jnp.stack([s, c])]))
 
 
-def _with_keyframe(
-    state: Track, surface: Surface, here: Float[Array, "3"], is_keyframe: Bool[Array, ""]
-) -> Surface:
+def _with_keyframe(state: Track, surface: Surface, here: Float[Array, "3"], is_keyframe: Bool[Array, ""]) -> Surface:
     """The surfaces of the last keyframes, about the newest."""
     size = surface.valid.shape[0]
     begin = state.count % KEYFRAMES * size
@@ -173,7 +171,7 @@ def _with_keyframe(
         return jax.lax.dynamic_update_slice_in_dim(old, new, begin, 0)
 
     grown = jax.tree.map(put, state.surface, seen_from(surface, here))
-    grown = dataclasses.replace(grown, position=grown.position - here[:2])
+    grown = dataclasses.replace(grown, position=grown.position - here[None, :2])
     return jax.tree.map(lambda new, old: jnp.where(is_keyframe, new, old), grown, state.surface)
 
 

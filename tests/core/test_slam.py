@@ -1,0 +1,303 @@
+"""Surfaces, registration, loops, the pose graph and the adjustment: against NumPy, and in rooms that are known."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from linemap_jax.core.estimation.adjustment import Sightings, adjust, residual_of_sighting
+from linemap_jax.core.estimation.loops import LoopSettings, close_loop
+from linemap_jax.core.estimation.pose_graph import Closures, PoseGraph, cov_of_registration, optimise
+from linemap_jax.core.estimation.registration import nearest, register
+from linemap_jax.core.estimation.surface import Surface, seen_from, surface_of_scan
+from linemap_jax.core.state import Scan, empty_lines
+
+BEARINGS = np.deg2rad(np.arange(180) - 89.5)
+ROOM = np.array([[-4.0, -3.0], [5.0, -3.0], [5.0, 1.0], [3.0, 1.0], [3.0, 3.0], [-4.0, 3.0]])
+CORRIDOR = np.array([[-40.0, -1.0], [40.0, -1.0], [40.0, 1.0], [-40.0, 1.0]])
+
+
+def ranges_in(corners: np.ndarray, pose: Any) -> np.ndarray:
+    """What a scanner measures inside of a polygon."""
+    x, y, theta = pose
+    begin, end = corners, np.roll(corners, -1, 0)
+    direction = np.stack([np.cos(theta + BEARINGS), np.sin(theta + BEARINGS)], -1)
+    along = end - begin
+    det = direction[:, None, 0] * along[None, :, 1] - direction[:, None, 1] * along[None, :, 0]
+    off = begin - [x, y]
+    reach = (off[None, :, 0] * along[None, :, 1] - off[None, :, 1] * along[None, :, 0]) / det
+    share = (off[None, :, 0] * direction[:, None, 1] - off[None, :, 1] * direction[:, None, 0]) / det
+    hit = (reach > 0) & (share >= 0) & (share <= 1)
+    return np.where(hit, reach, np.inf).min(1)
+
+
+def surface_in(corners: np.ndarray, pose: Any, noise: np.random.Generator | None = None) -> Surface:
+    ranges = ranges_in(corners, pose)
+    if noise is not None:
+        ranges = ranges + noise.normal(0, 0.01, ranges.shape)
+    return SURFACE(Scan.from_ranges(jnp.asarray(ranges, "float32"), jnp.asarray(BEARINGS, "float32"), range_max=30.0))
+
+
+SURFACE = jax.jit(surface_of_scan)
+REGISTER = jax.jit(register)
+CLOSE = jax.jit(close_loop)
+
+
+def test_the_surface_of_a_room() -> None:
+    """Normals are those of the walls, and point to the scanner; a lone point is not flat."""
+    surface = surface_in(ROOM, (0.0, 0.0, 0.0))
+    bottom = np.asarray(surface.flat) & (np.abs(surface.position[:, 1] + 3) < 1e-3)
+    assert bottom.sum() > 20
+    off = np.abs(np.asarray(surface.normal)[bottom] - [0.0, 1.0]).max(1)
+    assert (off[2:-2] < 1e-3).all()  # those beside the corners have neighbours on the next wall
+    ranges = np.full(180, 5.0)
+    ranges[90] = 1.0
+    alone = SURFACE(Scan.from_ranges(jnp.asarray(ranges, "float32"), jnp.asarray(BEARINGS, "float32"), range_max=30.0))
+    assert not alone.flat[90]
+    assert alone.valid[90]
+
+
+@pytest.mark.parametrize("count", [5, 64, 300])
+def test_nearest_neighbours(count: int) -> None:
+    random = np.random.default_rng(count)
+    points, others = random.uniform(-20, 20, (2, 300, 2))[:, :, :]
+    others, valid = others[:count], random.random(count) < 0.8
+    found = np.asarray(nearest(jnp.asarray(points), jnp.asarray(others), jnp.asarray(valid)))
+    distance = np.where(valid, np.hypot(*(points[:, None] - others[None]).transpose(2, 0, 1)), np.inf)
+    assert valid[found].all()
+    np.testing.assert_allclose(distance[np.arange(300), found], distance.min(1), rtol=1e-4)
+
+
+def test_registration_finds_the_pose() -> None:
+    random = np.random.default_rng(0)
+    first, truth = (0.0, 0.0, 0.0), np.array([0.3, -0.2, 0.15])
+    old, new = surface_in(ROOM, first, random), surface_in(ROOM, truth, random)
+    prior = jnp.eye(3, dtype="float32")
+    found = REGISTER(new, old, jnp.zeros(3, "float32"), prior)
+    assert (np.abs(found.pose - truth) < [0.01, 0.01, 0.003]).all()
+    assert found.share > 0.9
+
+
+def test_along_a_corridor_registration_holds_to_the_guess() -> None:
+    """And its information says that it knows nothing of that direction."""
+    random = np.random.default_rng(1)
+    old, new = surface_in(CORRIDOR, (0.0, 0.0, 0.0), random), surface_in(CORRIDOR, (1.0, 0.1, 0.0), random)
+    guess = jnp.asarray([0.7, 0.0, 0.02], "float32")
+    found = REGISTER(new, old, guess, jnp.diag(jnp.asarray([100.0, 100.0, 100.0], "float32")))
+    assert abs(found.pose[0] - 0.7) < 0.1
+    assert abs(found.pose[1] - 0.1) < 0.01
+    assert found.information[0, 0] < 0.02 * found.information[1, 1]
+
+
+def around(surface: Surface) -> tuple[Surface, jax.Array, jax.Array]:
+    """One older keyframe, and room for others beside it."""
+    stacked = jax.tree.map(lambda x: jnp.stack([x] * 3), surface)
+    return stacked, jnp.zeros((3, 3), "float32"), jnp.asarray([False, True, False])
+
+
+def test_a_loop_is_found_metres_away() -> None:
+    random = np.random.default_rng(2)
+    truth = np.array([0.5, 0.4, -0.2])
+    old, new = surface_in(ROOM, (0.0, 0.0, 0.0), random), surface_in(ROOM, truth, random)
+    guess, path = jnp.asarray([2.6, -1.8, 0.1], "float32"), jnp.asarray(60.0, "float32")
+    found = CLOSE(new, *around(old), guess, path)
+    assert found.believed
+    assert (np.abs(found.step - truth) < [0.02, 0.02, 0.005]).all()
+
+
+def test_a_corridor_closes_no_loop() -> None:
+    """Every place along it looks alike: where the drift is large, nothing is believed."""
+    random = np.random.default_rng(3)
+    old, new = surface_in(CORRIDOR, (0.0, 0.0, 0.0), random), surface_in(CORRIDOR, (3.0, 0.0, 0.0), random)
+    found = CLOSE(new, *around(old), jnp.zeros(3, "float32"), jnp.asarray(60.0, "float32"))
+    assert found.share > LoopSettings().share_far  # it fits well
+    assert not found.believed
+
+
+def compose(a: Any, b: Any) -> np.ndarray:
+    c, s = np.cos(a[2]), np.sin(a[2])
+    return np.array([a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1], a[2] + b[2]])
+
+
+def between(a: Any, b: Any) -> np.ndarray:
+    c, s = np.cos(a[2]), np.sin(a[2])
+    dx, dy, turn = np.subtract(b, a)
+    return np.array([c * dx + s * dy, -s * dx + c * dy, np.arctan2(np.sin(turn), np.cos(turn))])
+
+
+def square_drive(random: np.random.Generator) -> tuple[np.ndarray, PoseGraph]:
+    """Two laps of a square, with noise on the steps, true closures between the laps, a wrong one, and padding."""
+    truth = [np.zeros(3)]
+    for i in range(39):
+        truth.append(compose(truth[-1], [1.0, 0.0, np.pi / 2 if i % 5 == 4 else 0.0]))
+    sigma = np.array([0.02, 0.02, 0.01])
+    noisy = [between(a, b) + random.normal(0, sigma) for a, b in zip(truth[:-1], truth[1:], strict=True)]
+    start = [np.zeros(3)]
+    for step in noisy:
+        start.append(compose(start[-1], step))
+    pairs = [(i, i + 20) for i in range(0, 20, 2)]
+    steps = [between(truth[i], truth[j]) + random.normal(0, sigma / 4) for i, j in pairs]
+    pairs.append((3, 30))
+    steps.append(between(truth[3], truth[30]) + [1.5, -1.0, 0.3])
+    n, e = 48, 16
+
+    def filled(values: Any, size: int, pad: Any) -> jax.Array:
+        return jnp.asarray(list(values) + [pad] * (size - len(values)))
+
+    garbage, identity = np.full(3, 7.0), np.eye(3)
+    closures = Closures(
+        begin=filled([i for i, _ in pairs], e, 5),
+        end=filled([j for _, j in pairs], e, 2),
+        step=filled(steps, e, garbage),
+        cov=filled([np.diag((sigma / 4) ** 2)] * len(pairs), e, identity),
+        weight=jnp.ones(e),
+        valid=filled([True] * len(pairs), e, False),
+    )
+    graph = PoseGraph(
+        poses=filled(start, n, garbage),
+        step=filled([np.zeros(3), *noisy], n, garbage),
+        cov_step=filled([np.diag(sigma**2)] * 40, n, identity),
+        valid=filled([True] * 40, n, False),
+        closures=closures,
+    )
+    return np.array(truth), graph
+
+
+def numpy_optimum(graph: PoseGraph, count: int, closures: int) -> np.ndarray:
+    """Gauss and Newton with dense matrices and numerical derivatives."""
+    poses = np.asarray(graph.poses)[:count].copy()
+    c = jax.tree.map(np.asarray, graph.closures)
+    edges = [(i - 1, i, np.asarray(graph.step[i]), np.asarray(graph.cov_step[i])) for i in range(1, count)]
+    edges += [(c.begin[k], c.end[k], c.step[k], c.cov[k]) for k in range(closures)]
+
+    def residuals(flat: np.ndarray) -> np.ndarray:
+        at = np.concatenate([poses[:1], flat.reshape(-1, 3)])
+        off = []
+        for i, j, step, cov in edges:
+            e = between(at[i], at[j]) - step
+            e[2] = np.arctan2(np.sin(e[2]), np.cos(e[2]))
+            off.append(np.linalg.solve(np.linalg.cholesky(cov), e))
+        return np.concatenate(off)
+
+    flat = poses[1:].ravel()
+    for _ in range(4):
+        r = residuals(flat)
+        jac = np.stack([(residuals(flat + h) - r) / 1e-7 for h in 1e-7 * np.eye(flat.size)], -1)
+        flat = flat - np.linalg.lstsq(jac, r, rcond=None)[0]
+    return np.concatenate([poses[:1], flat.reshape(-1, 3)])
+
+
+def test_the_graph_settles_where_dense_least_squares_does() -> None:
+    """The wrong closure loses its weight, and the true ones keep nearly all of theirs."""
+    truth, graph = square_drive(np.random.default_rng(4))
+    done = jax.jit(optimise)(graph)
+    weight = np.asarray(done.closures.weight)
+    assert weight[10] < 1e-3
+    assert (weight[:10] > 0.2).all()
+    assert (weight[11:] == 0).all()
+    poses = np.asarray(done.poses)[:40]
+    assert np.abs(poses - truth)[:, :2].max() < 0.5 * np.abs(np.asarray(graph.poses)[:40] - truth)[:, :2].max()
+    # With the weights that the closures have in the end, it is a plain least squares problem.
+    kept = np.asarray(graph.closures.cov)[:10] / weight[:10, None, None]
+    plain = Closures(
+        begin=graph.closures.begin,
+        end=graph.closures.end,
+        step=graph.closures.step,
+        cov=graph.closures.cov.at[:10].set(kept),
+        weight=graph.closures.weight,
+        valid=graph.closures.valid,
+    )
+    same = PoseGraph(poses=graph.poses, step=graph.step, cov_step=graph.cov_step, valid=graph.valid, closures=plain)
+    np.testing.assert_allclose(poses, numpy_optimum(same, 40, 10), atol=2e-4)
+
+
+def test_a_doubtful_registration_says_little() -> None:
+    information, prior = 1e5 * jnp.eye(3), jnp.eye(3)
+    sure, none = (cov_of_registration(information, jnp.asarray(share), prior) for share in (0.9, 0.3))
+    assert sure[0, 0] < 4e-4
+    np.testing.assert_allclose(np.diag(none), [1, 1, 1], rtol=1e-3)
+
+
+def test_poses_and_lines_adjusted_together() -> None:
+    """Against dense least squares in NumPy, estimates and covariances; a sighting of another line is left out."""
+    random = np.random.default_rng(5)
+    _, graph = square_drive(random)
+    graph = jax.jit(optimise)(graph)
+    count, poses = 40, np.asarray(graph.poses)
+    walls = [(np.array([8.0, 2.0]), 0.02), (np.array([2.0, 9.0]), 1.55), (np.array([-3.0, 2.0]), 3.1)]
+    seen = []
+    for k in range(count):
+        for slot, (point, angle) in enumerate(walls):
+            anchor = between(poses[k], [*point, 0.0])[:2]
+            seen.append((k, slot, anchor, angle - poses[k, 2]))
+    sigma = np.array([0.005, 0.002])
+    noisy = [
+        (k, slot, at + random.normal(0, sigma[0]) * np.array([np.cos(a), np.sin(a)]), a + random.normal(0, sigma[1]))
+        for k, slot, at, a in seen
+    ]
+    noisy.append((7, 1, noisy[0][2], noisy[0][3]))  # of another wall
+    lines = empty_lines(4, "float64")
+    lines = jax.tree.map(jnp.asarray, lines)
+    lines.anchor.at[:3]  # noqa: B018
+    lines = type(lines)(
+        **{
+            **{name: getattr(lines, name) for name in lines.__dataclass_fields__},
+            "anchor": lines.anchor.at[:3].set(jnp.asarray([point for point, _ in walls])),
+            "angle": lines.angle.at[:3].set(jnp.asarray([angle for _, angle in walls])),
+            "valid": lines.valid.at[:3].set(True),
+        }
+    )
+    sightings = Sightings(
+        keyframe=jnp.asarray([s[0] for s in noisy] + [0]),
+        line=jnp.asarray([s[1] for s in noisy] + [3]),
+        anchor=jnp.asarray([s[2] for s in noisy] + [np.zeros(2)]),
+        angle=jnp.asarray([s[3] for s in noisy] + [0.0]),
+        cov=jnp.asarray([np.diag(sigma**2)] * len(noisy) + [np.eye(2)]),
+        valid=jnp.asarray([True] * len(noisy) + [False]),
+    )
+    done = jax.jit(adjust)(graph, lines, sightings)
+    assert done.seen.tolist() == [True, True, True, False]
+    assert 0.8 < done.unit_variance < 1.2
+
+    weight = np.asarray(graph.closures.weight)
+    c = jax.tree.map(np.asarray, graph.closures)
+    steps = [(i - 1, i, np.asarray(graph.step[i]), np.asarray(graph.cov_step[i])) for i in range(1, count)]
+    steps += [(c.begin[k], c.end[k], c.step[k], c.cov[k] / max(weight[k], 1e-12)) for k in range(11)]
+    residual = jax.jit(residual_of_sighting)
+
+    def residuals(flat: np.ndarray) -> np.ndarray:
+        at = np.concatenate([poses[:1], flat[: 3 * (count - 1)].reshape(-1, 3)])
+        state = flat[3 * (count - 1) :].reshape(-1, 2)
+        off = []
+        for i, j, step, cov in steps:
+            e = between(at[i], at[j]) - step
+            e[2] = np.arctan2(np.sin(e[2]), np.cos(e[2]))
+            off.append(np.linalg.solve(np.linalg.cholesky(cov), e))
+        for k, slot, anchor, angle in noisy[:-1]:
+            off.append(np.asarray(residual(at[k], state[slot], walls[slot][0], anchor, angle)) / sigma)
+        return np.concatenate(off)
+
+    flat = np.concatenate([poses[1:count].ravel(), np.ravel([[0.0, angle] for _, angle in walls])])
+    for _ in range(2):
+        r = residuals(flat)
+        jac = np.stack([(residuals(flat + h) - r) / 1e-7 for h in 1e-7 * np.eye(flat.size)], -1)
+        flat = flat - np.linalg.lstsq(jac, r, rcond=None)[0]
+    np.testing.assert_allclose(np.asarray(done.poses)[1:count].ravel(), flat[: 3 * (count - 1)], atol=2e-5)
+    np.testing.assert_allclose(np.stack([done.lines.offset, done.lines.angle], -1)[:3].ravel(), flat[-6:], atol=2e-5)
+    cov = np.linalg.inv(jac.T @ jac) * max(float(done.unit_variance), 1)
+    np.testing.assert_allclose(done.lines.cov[2], cov[-2:, -2:], rtol=1e-3)
+    np.testing.assert_allclose(done.cov_poses[count - 1], cov[114:117, 114:117], rtol=1e-3, atol=1e-9)
+
+
+def test_seen_from_a_pose() -> None:
+    surface = Surface(
+        position=jnp.asarray([[1.0, 0.0]]),
+        normal=jnp.asarray([[-1.0, 0.0]]),
+        flat=jnp.ones(1, bool),
+        valid=jnp.ones(1, bool),
+    )
+    moved = seen_from(surface, jnp.asarray([2.0, 3.0, np.pi / 2]))
+    np.testing.assert_allclose(moved.position, [[2.0, 4.0]], atol=1e-15)
+    np.testing.assert_allclose(moved.normal, [[0.0, -1.0]], atol=1e-15)

@@ -1,0 +1,126 @@
+"""`linemap slam` on a simulated drive around a block, from what the wheels have counted."""
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from linemap_jax.cli import main
+from linemap_jax.core.frames import compose
+from linemap_jax.io.carmen_writer import write_carmen
+from linemap_jax.io.map_file import read_map
+from linemap_jax.io.tum import read_tum
+from linemap_jax.lab.generators import ring
+from linemap_jax.lab.scanners import pls
+from linemap_jax.lab.simulate import simulate
+
+SCANS = 400
+
+
+class Drive:
+    """A log, and the truth of it."""
+
+    def __init__(self, folder: Path) -> None:
+        key = jax.random.key(3)
+        made = jax.jit(
+            lambda key: simulate(
+                key, ring(key, dtype=jnp.float32), pls(), count=SCANS, cov_pose=jnp.zeros((3, 3), "float32")
+            )
+        )(key)
+        self.truth = np.asarray(made.true_poses, float)
+
+        def step(pose: jax.Array, increment: jax.Array) -> tuple[jax.Array, jax.Array]:
+            pose = compose(pose, increment)
+            return pose, pose
+
+        later = jax.lax.scan(step, made.true_poses[0], made.odometry)[1]
+        self.odometry = np.concatenate([self.truth[:1], np.asarray(later, float)])
+        self.ranges = np.where(made.scans.valid, made.scans.ranges, 81.0)[:, ::2]  # so many beams as in test_cli.py
+        self.bearings = np.asarray(made.scans.bearings[0], float)[::2]
+        self.log = folder / "drive.log"
+        self.write(self.log)
+
+    def write(self, path: Path, scans: slice = slice(None), stamps: np.ndarray | None = None) -> None:
+        """As raw logs are: both poses are odometry's."""
+        odometry = self.odometry[scans]
+        write_carmen(
+            path,
+            ranges=self.ranges[scans],
+            bearings=self.bearings,
+            range_max=50.0,
+            poses=odometry,
+            odometry=odometry,
+            timestamps=0.25 * np.arange(len(odometry)) if stamps is None else stamps,
+        )
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
+    return Drive(tmp_path_factory.mktemp("drive"))
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., Any]:
+    """Runs the command line in this process; gives the exit status, and what stands on stdout and stderr."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+    def run(*args: Any) -> tuple[int, str, str]:
+        capsys.readouterr()
+        return main([str(arg) for arg in args]), *capsys.readouterr()
+
+    return run
+
+
+def test_a_drive_around_a_block(drive: Drive, run: Callable[..., Any], tmp_path: Path) -> None:
+    """Odometry ends half a metre off or more, the trajectory within centimetres; every scan has its pose."""
+    status, out, _ = run("slam", drive.log, "-o", tmp_path / "out", "--json")
+    assert status == 0
+    told = json.loads(out)
+    found = read_tum(tmp_path / "out" / "trajectory.tum")
+    np.testing.assert_allclose(found.stamps, 0.25 * np.arange(SCANS), atol=1e-6)
+    assert np.hypot(*(drive.odometry - drive.truth)[-1, :2]) > 0.5
+    off = found.poses - drive.truth
+    assert np.hypot(off[:, 0], off[:, 1]).max() < 0.1
+    assert np.abs(np.angle(np.exp(1j * off[:, 2]))).max() < 0.02
+    assert told["loops"] > 20
+    assert told["explained"] > 0.9
+
+    line_map, settings = read_map(tmp_path / "out" / "map.json", dtype="float32")
+    lines = jax.tree.map(np.asarray, line_map.lines)
+    assert settings["slam"]["keyframes"] == told["keyframes"]
+    outer = lines.valid & (np.abs(np.abs(np.sin(lines.angle)) - 1) < 1e-3) & (lines.anchor[:, 1] < -6.5)
+    longest = np.flatnonzero(outer)[np.argmax(np.asarray(line_map.lines.length)[outer])]
+    y = np.asarray(line_map.lines.begin)[longest, 1]
+    assert abs(y + 7.0) < 4 * math.sqrt(np.asarray(line_map.lines.cov)[longest, 0, 0]) + 0.01
+
+
+@pytest.mark.parametrize("name", ["map.json", "map.png", "trajectory.tum"])
+def test_nothing_is_overwritten(name: str, drive: Drive, run: Callable[..., Any], tmp_path: Path) -> None:
+    (tmp_path / name).write_text("mine")
+    status, out, err = run("slam", drive.log, "-o", tmp_path)
+    assert (status, out) == (2, "")
+    assert f"{name} exists already" in err
+    assert (tmp_path / name).read_text() == "mine"
+
+
+def test_a_robot_that_is_carried_away(drive: Drive, run: Callable[..., Any], tmp_path: Path) -> None:
+    """What it sees then agrees with nothing: it is told, and no number is lost. Nor does a laser's offset count here."""
+    kept = np.r_[0:40, 250:290]
+    stamps = np.r_[0.25 * np.arange(40), 100 + 0.25 * np.arange(40)]
+    odometry = drive.odometry.copy()
+    drive.odometry = drive.odometry - (drive.odometry[250] - drive.odometry[40]) * (np.arange(SCANS) >= 250)[:, None]
+    drive.write(tmp_path / "carried.log", kept, stamps)  # pyright: ignore[reportArgumentType]
+    drive.odometry = odometry
+    options = ("--trajectory-frame", "base", "--laser-offset", 0.2, 0, 0)
+    status, _, err = run("slam", tmp_path / "carried.log", "-o", tmp_path / "out", *options)
+    assert status == 0
+    assert "1 scan came more than 60 s after" in err
+    assert "few points agree with what was seen before" in err
+    assert "--laser-offset has no effect" in err
+    assert np.isfinite(read_tum(tmp_path / "out" / "trajectory.tum").poses).all()
