@@ -110,7 +110,7 @@ def test_nothing_is_overwritten(name: str, drive: Drive, run: Callable[..., Any]
 
 
 def test_a_robot_that_is_carried_away(drive: Drive, run: Callable[..., Any], tmp_path: Path) -> None:
-    """What it sees then agrees with nothing: it is told, and no number is lost. Nor does a laser's offset count here."""
+    """What it sees then agrees with nothing: it is told, and no number is lost. An offset of the laser changes nothing."""
     kept = np.r_[0:40, 250:290]
     stamps = np.r_[0.25 * np.arange(40), 100 + 0.25 * np.arange(40)]
     odometry = drive.odometry.copy()
