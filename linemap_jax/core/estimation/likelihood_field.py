@@ -28,6 +28,12 @@ WORST = 9.0
 DISCOUNT = 0.1
 """What a beam counts for in a search, beside the prior: what neighbouring beams get wrong, they get wrong alike."""
 
+REACH = 3.0
+"""How far to search, in sigmas of the prior."""
+
+Counts = tuple[tuple[int, int], ...]
+"""For each level of a search the nodes along either axis of the position, and along that of the heading."""
+
 
 @pytree
 class LikelihoodField:
@@ -131,26 +137,23 @@ def search(
     mean: Float[Array, "3"],
     root: Float[Array, "3 3"],
     *,
-    reach: float = 3.0,
-    counts: tuple[tuple[int, int], ...] = ((9, 25), (7, 9), (7, 9)),
+    counts: Counts,
 ) -> Float[Array, "3"]:
     """The pose that explains a scan best, of many around a prior: level by level on finer grids.
 
     A grid is one of the prior's own: its axes are the columns of the root of its covariance, so that it is as wide as
-    the prior is uncertain.
+    the prior is uncertain, `REACH` sigmas to either side.
 
     Args:
       field: of the map.
-      points: of the scan, in the frame of the robot, m.
+      points: of the scan, `thinned`, in the frame of the robot, m.
       valid: those that count.
       mean: of the prior.
       root: a square root of the prior's covariance.
-      reach: how far to search, in sigmas.
-      counts: for each level the nodes along either axis of the position, and along that of the heading.
+      counts: nodes of the grids.
     """
-    points, valid = thinned(points, valid)
     at = jnp.zeros(3, mean.dtype)  # in sigmas
-    span = jnp.full(3, reach, mean.dtype)
+    span = jnp.full(3, REACH, mean.dtype)
     for of_position, of_heading in counts:
         axes = [np.linspace(-1, 1, n) for n in (of_position, of_position, of_heading)]
         nodes = jnp.asarray(np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3), mean.dtype)

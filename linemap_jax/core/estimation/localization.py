@@ -32,7 +32,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from linemap_jax.core.estimation.likelihood_field import LikelihoodField, distances, search, thinned
+from linemap_jax.core.estimation.likelihood_field import Counts, LikelihoodField, distances, search, thinned
 from linemap_jax.core.estimation.odometry import OdometryNoise, cov_step
 from linemap_jax.core.extract import extract
 from linemap_jax.core.frames import (
@@ -65,7 +65,9 @@ STRAIGHT = 4.0
 """Mean square of residuals, in sigmas, up to which points lie along a segment."""
 OFTEN = 3
 """Lines that were seen so often stand where they are: a beam through one contradicts the pose."""
-FARTHER = ((17, 41), (9, 9), (7, 9))
+NEARBY: Counts = ((13, 25), (7, 9), (7, 9))
+"""Nodes of the search in every scan."""
+FARTHER: Counts = ((33, 49), (9, 9), (7, 9))
 """Nodes of the search for a robot that has been moved."""
 CLEARLY = 0.2
 """Share of returns by which a pose far away must explain more than one nearby; what lacks so much to explain a scan
@@ -92,6 +94,8 @@ class Tracking:
     slip_position: Number = 0.15
     """Wheels may slip, and clocks differ: the search of every scan reaches three times this farther than the
     prediction's own spread, m."""
+    slip_step: Number = 0.25
+    """And by what the wheels say that the robot has gone, up to this, m."""
     slip_heading: Number = 0.12
     """The same of the heading, rad."""
     astray_position: Number = 0.7
@@ -108,10 +112,13 @@ class Tracking:
     least_fit: Number = 0.4
     """Share of the returns that the map explains, less the share that contradicts it: with less, a scan is not used,
     and where it is less on the average, the robot is lost."""
+    sudden: Number = 0.6
+    """Nor is a scan used of which the map explains less than this share of what it has explained of late."""
     memory: Number = 0.7
     """What the average of the fit keeps from scan to scan: 0.7 forgets in about three."""
-    lost_position: Number = 0.3
-    """By so much more is the position unsure after each scan of a lost robot, m, up to the size of the map."""
+    lost_position: Number = 0.5
+    """By so much more is the position unsure after each scan that a lost robot cannot use, m, up to the size of the
+    map. Before it is known to be lost, it is by `slip_position`."""
     lost_heading: Number = 0.2
     """The same of the heading, rad, up to half a turn."""
 
@@ -237,7 +244,8 @@ def localize(
         finite = jnp.all(jnp.isfinite(move))
         expected = predict(belief, jnp.where(finite, move, 0), more, odometry)
         seen = observe(scan, mount, thresholds=thresholds, noise=noise, **options)
-        after, located = locate(expected, seen, line_map, lines, field, thresholds, rules, noise, tracking)
+        moved = jnp.where(finite, jnp.sqrt(dot(move[:2], move[:2])), 0)
+        after, located = locate(expected, seen, moved, line_map, lines, field, thresholds, rules, noise, tracking)
         status = located.status | jnp.where(finite, 0, int(Status.POSE_NOT_FINITE))
         after = jax.tree.map(lambda a, b: jnp.where(is_active, a, b), after, belief)
         return after, dataclasses.replace(located, status=status)
@@ -300,6 +308,7 @@ def observe(
 def locate(
     belief: Belief,
     seen: Seen,
+    moved: Float[Array, ""],
     line_map: LineMap,
     lines: Lines,
     field: LikelihoodField,
@@ -313,6 +322,7 @@ def locate(
     Args:
       belief: predicted.
       seen: what the scan holds.
+      moved: how far the wheels say that the robot has gone, m.
       line_map: the map.
       lines: those of the map, directed.
       field: of the map.
@@ -323,7 +333,7 @@ def locate(
     """
     dtype = belief.mean.dtype
     cov = belief.cov
-    found = _found(belief.mean, cov, seen, field, tracking)
+    found = _found(belief, seen, moved, field, tracking)
     resolution = _diagonal(tracking.search_position, tracking.search_heading, dtype)
     off = _minus(found, belief.mean)
     surprise = quadratic(off, inverse(cov + resolution))
@@ -352,11 +362,11 @@ def locate(
     _, after, sightings, nis = jax.lax.fori_loop(0, ITERATIONS, look, carry)
 
     fit = fit_of_scan(seen, after.mean, lines, field, tracking)
-    used = fit >= tracking.least_fit
+    used = (fit >= tracking.least_fit) & (fit >= tracking.sudden * belief.fit)
     average = tracking.memory * belief.fit + (1 - tracking.memory) * fit
     lost = average < tracking.least_fit
     after = jax.tree.map(lambda a, b: jnp.where(used, a, b), after, belief)
-    after = dataclasses.replace(_less_sure(after, lost & ~used, field, tracking), fit=average, lost=lost)
+    after = dataclasses.replace(_less_sure(after, used, lost, field, tracking), fit=average, lost=lost)
     count = lines.valid.shape[0]
 
     def used_of(which: Bool[Array, " S"]) -> Int[Array, ""]:
@@ -364,7 +374,7 @@ def locate(
 
     located = Located(
         pose=after.pose,
-        nis=jnp.where(used, nis, 0),
+        nis=jnp.where(used, jnp.asarray(nis), 0),
         dof=2 * used_of(sightings.valid),
         lines=used_of(sightings.slot < count),
         circles=used_of(sightings.slot >= count),
@@ -375,29 +385,33 @@ def locate(
 
 
 def _found(
-    mean: Float[Array, "3"], cov: Float[Array, "3 3"], seen: Seen, field: LikelihoodField, tracking: Tracking
+    belief: Belief, seen: Seen, moved: Float[Array, ""], field: LikelihoodField, tracking: Tracking
 ) -> Float[Array, "3"]:
     """Where to look: the pose near the prediction that explains the scan best; farther away if none near does."""
-    dtype = mean.dtype
+    dtype = belief.mean.dtype
     points, valid = thinned(seen.points, seen.returned)
 
-    def around(position: Number, heading: Number, **options: Any) -> Float[Array, "3"]:
-        wide = cov + _diagonal(position, heading, dtype)
-        return search(field, seen.points, seen.returned, mean, _root(wide), **options)
+    def around(position: Number, heading: Number, counts: Counts) -> Float[Array, "3"]:
+        root = _root(belief.cov + _diagonal(position, heading, dtype))
+        return search(field, points, valid, belief.mean, root, counts=counts)
 
     def explained(pose: Float[Array, "3"]) -> Float[Array, ""]:
         turned = jax.vmap(lambda p: rotate(pose[2], p))(points) + pose[None, :2]
         near = valid & (distances(field, turned) < tracking.explained_distance)
         return jnp.sum(near) / jnp.maximum(jnp.sum(valid), 1)
 
-    near = around(tracking.slip_position, tracking.slip_heading)
+    # Wheels may slip altogether, or run backwards and be counted forwards.
+    slip = jnp.sqrt(tracking.slip_position**2 + jnp.minimum(moved, tracking.slip_step) ** 2)
+    near = around(slip, tracking.slip_heading, NEARBY)
     of_near = explained(near)
+    enough = tracking.least_fit + CLEARLY
+    astray = (of_near < enough) & (tracking.memory * belief.fit + (1 - tracking.memory) * of_near < enough)
 
     def farther() -> Float[Array, "3"]:
-        far = around(tracking.astray_position, tracking.astray_heading, counts=FARTHER)
+        far = around(tracking.astray_position, tracking.astray_heading, FARTHER)
         return jnp.where(explained(far) > of_near + CLEARLY, far, near)
 
-    return jax.lax.cond(of_near < CLEARLY + tracking.least_fit, farther, lambda: near)
+    return jax.lax.cond(astray, farther, lambda: near)
 
 
 def sight_lines(
@@ -626,7 +640,7 @@ def update(belief: Belief, at: Float[Array, "3"], sightings: Sightings) -> tuple
     gain = gain + common_white.T - common_white.T @ h_white @ gain
     gain = jax.scipy.linalg.solve_triangular(lower, gain.T, lower=True, trans=1).T
     told = h_white.T @ y_white
-    nis = y_white @ y_white - told @ own @ told
+    nis = jnp.sum(y_white**2) - quadratic(told, own)
 
     left = jnp.eye(3, dtype=dtype) - gain @ h
     of_each = gain.reshape(3, n, 2)
@@ -672,12 +686,19 @@ def fit_of_scan(
     return jnp.where(jnp.any(valid), (jnp.sum(explained) - jnp.sum(through)) / count, 0).astype(pose.dtype)
 
 
-def _less_sure(belief: Belief, which: Bool[Array, ""], field: LikelihoodField, tracking: Tracking) -> Belief:
-    """The belief of a robot that is lost: it may have gone anywhere, but is not likely to have left the map."""
-    more = _diagonal(tracking.lost_position, tracking.lost_heading, belief.mean.dtype)
-    most = jnp.stack([field.cell * field.distance.shape[0] / 2] * 2 + [jnp.asarray(np.pi, belief.mean.dtype)]) ** 2
+def _less_sure(
+    belief: Belief, used: Bool[Array, ""], lost: Bool[Array, ""], field: LikelihoodField, tracking: Tracking
+) -> Belief:
+    """The belief after a scan that the map does not explain: the wheels may have slipped unseen.
+
+    Of a robot that is lost: it may have gone anywhere, but is not likely to have left the map.
+    """
+    dtype = belief.mean.dtype
+    slipped = _diagonal(tracking.slip_position, tracking.slip_heading, dtype)
+    more = jnp.where(lost, _diagonal(tracking.lost_position, tracking.lost_heading, dtype), slipped)
+    most = jnp.stack([field.cell * field.distance.shape[0] / 2] * 2 + [jnp.asarray(np.pi, dtype)]) ** 2
     room = jnp.diag(belief.cov) < most
-    return dataclasses.replace(belief, cov_own=belief.cov_own + jnp.where(which, more * room[None], 0))
+    return dataclasses.replace(belief, cov_own=belief.cov_own + jnp.where(used, 0, more * room[None]))
 
 
 def _minus(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, "3"]:

@@ -158,7 +158,7 @@ def update_by_beacons(
     cov = cov_measurement(noise).astype(dtype)
     index = jnp.arange(beacons.valid.shape[0])
 
-    def step(pose: Pose, x: tuple[Array, Array, Array]) -> tuple[Pose, BeaconReport]:
+    def step(pose: Pose, x: tuple[Array, Array, Array]) -> tuple[Pose, tuple[Array, Array, Array]]:
         measurement, name, valid = x
 
         def compare(beacon: Float[Array, "2"]) -> tuple[Pose, Array]:
@@ -174,11 +174,8 @@ def update_by_beacons(
         best, value = least(nis[None])
         alone = jnp.sum(nis < gate) == 1
         compared = jnp.isfinite(value[0])
-        report = BeaconReport(
-            beacon=jnp.where(alone, best[0], -1).astype(jnp.int32),
-            nis=jnp.where(compared, value[0], 0),
-            dof=jnp.where(compared, 2, 0).astype(jnp.int32),
-        )
+        report = jnp.where(alone, best[0], -1), jnp.where(compared, value[0], 0), jnp.where(compared, 2, 0)
         return jax.tree.map(lambda a, b: jnp.where(alone, a[best[0]], b), after, pose), report
 
-    return jax.lax.scan(step, pose, (readings.measurement, readings.beacon, readings.valid))
+    pose, (used, nis, dof) = jax.lax.scan(step, pose, (readings.measurement, readings.beacon, readings.valid))
+    return pose, BeaconReport(beacon=used.astype(jnp.int32), nis=nis, dof=dof.astype(jnp.int32))
