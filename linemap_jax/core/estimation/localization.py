@@ -629,18 +629,16 @@ def update(belief: Belief, at: Float[Array, "3"], sightings: Sightings) -> tuple
     of_walls = jnp.einsum("iab,jcb,ij->iajc", by_map, by_map, same).reshape(2 * n, 2 * n)
     of_noise = jnp.einsum("iab,ij->iajb", cov, jnp.eye(n, dtype=dtype)).reshape(2 * n, 2 * n)
     mixed = h @ common
-    lower = jnp.linalg.cholesky(h @ of_map @ h.T + mixed + mixed.T + of_walls + of_noise)
-
-    def whitened(x: Float[Array, "m n"]) -> Float[Array, "m n"]:
-        return jax.scipy.linalg.solve_triangular(lower, x, lower=True)
-
-    h_white, y_white, common_white = whitened(h), whitened(y[:, None])[:, 0], whitened((of_map @ h.T + common).T)
-    own = jnp.linalg.solve(jnp.eye(3, dtype=dtype) + belief.cov_own @ h_white.T @ h_white, belief.cov_own)
+    total = h @ of_map @ h.T + mixed + mixed.T + of_walls + of_noise
+    white = _inverse_root(total)
+    h_white, y_white, common_white = white @ h, white @ y, white @ (of_map @ h.T + common).T
+    # (1 + C_own J)^-1 C_own = R (1 + R' J R)^-1 R', J = H' T^-1 H: of a symmetric matrix, and no inverse of C_own.
+    root = square_root(belief.cov_own)
+    j_root = h_white @ root
+    own = root @ inverse(jnp.eye(3, dtype=dtype) + j_root.T @ j_root) @ root.T
     gain = own @ h_white.T
-    gain = gain + common_white.T - common_white.T @ h_white @ gain
-    gain = jax.scipy.linalg.solve_triangular(lower, gain.T, lower=True, trans=1).T
-    told = h_white.T @ y_white
-    nis = jnp.sum(y_white**2) - quadratic(told, own)
+    gain = (gain + common_white.T - common_white.T @ h_white @ gain) @ white
+    nis = jnp.sum(y_white**2) - quadratic(h_white.T @ y_white, own)
 
     left = jnp.eye(3, dtype=dtype) - gain @ h
     of_each = gain.reshape(3, n, 2)
@@ -653,6 +651,26 @@ def update(belief: Belief, at: Float[Array, "3"], sightings: Sightings) -> tuple
         by_map=carried.at[:, sightings.slot].add(-added),
     )
     return after, nis
+
+
+def _inverse_root(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """W with W A W^T = 1, lower triangular: the inverse of Cholesky's root, by elimination.
+
+    Not by LAPACK: a program that calls it, traced by one process and run by another (`jax.export`), crashes there,
+    since nobody has loaded LAPACK (jax 0.8.3).
+    """
+    n = matrix.shape[0]
+    rows = jnp.arange(n)
+
+    def step(k: Array, both: Float[Array, "n m"]) -> Float[Array, "n m"]:
+        column = both[:, k]
+        pivot = 1 / jnp.sqrt(column[k])
+        row = both[k] * pivot
+        below = jnp.where(rows > k, column * pivot, 0)
+        return (both - below[:, None] * row[None]).at[k].set(row)
+
+    both = jnp.concatenate([matrix, jnp.eye(n, dtype=matrix.dtype)], 1)
+    return jax.lax.fori_loop(0, n, step, both)[:, n:]
 
 
 def fit_of_scan(
