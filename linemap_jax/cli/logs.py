@@ -10,6 +10,8 @@ from linemap_jax.cli.options import LogInput, LogOptions
 from linemap_jax.cli.output import say
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from linemap_jax.core.settings import Mount
     from linemap_jax.core.state import Pose, Scan
     from linemap_jax.io.log import Log
@@ -50,6 +52,13 @@ def mount_of(command: LogInput, log: "Log", *, quiet: bool) -> "Mount":
     return Mount(*(reading.mount or (0.0, 0.0, 0.0)))
 
 
+def mount_of_odometry(command: LogInput, log: "Log") -> "Mount":
+    """How the laser sits on the robot, whose odometry it is. The log is read up to its first scan."""
+    from linemap_jax.core.settings import Mount
+
+    return Mount(*(command.laser_offset or next(iter(log)).mount or (0.0, 0.0, 0.0)))
+
+
 def chunks_of_log(command: LogOptions, log: "Log", size: int) -> Iterator["Chunk"]:
     """Scans and poses as the options want them."""
     import numpy as np
@@ -58,6 +67,16 @@ def chunks_of_log(command: LogOptions, log: "Log", size: int) -> Iterator["Chunk
 
     cov_pose = np.diag(np.square(command.pose_sigma))
     return chunks_of_readings(log, size, cov_pose=cov_pose, every=command.every, dtype=command.dtype)
+
+
+def odometry_of(command: LogOptions, chunk: "Chunk") -> "np.ndarray":
+    """Odometry's poses of the robot: those given, else the log's own, else its poses, which come from odometry."""
+    import numpy as np
+
+    poses = np.asarray(chunk.poses.mean, float)
+    if command.poses is not None or command.standstill:
+        return poses
+    return np.where(np.isfinite(chunk.odometry), chunk.odometry, poses)
 
 
 def plain_chunks(log: "Log", every: int = 1) -> Iterator[tuple["Scan", "Pose"]]:

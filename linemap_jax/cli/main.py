@@ -14,6 +14,7 @@ from linemap_jax.cli.evaluate import Evaluate
 from linemap_jax.cli.export import Export
 from linemap_jax.cli.extract import Extract
 from linemap_jax.cli.info import Info
+from linemap_jax.cli.localize import Localize
 from linemap_jax.cli.merge import Merge
 from linemap_jax.cli.options import UsageError
 from linemap_jax.cli.simulate import Simulate
@@ -23,7 +24,7 @@ from linemap_jax.cli.verify import Verify
 
 DESCRIPTION = """Maps of line segments and circles from 2D range scans, with covariances that can be believed.
 
-Maps: demo, build, slam, export, merge, compare.
+Maps: demo, build, slam, localize, export, merge, compare.
 
 Logs: info, extract, calibrate, config.
 
@@ -36,6 +37,7 @@ Command = (
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Merge, tyro.conf.subcommand("merge")]
     | Annotated[Compare, tyro.conf.subcommand("compare")]
+    | Annotated[Localize, tyro.conf.subcommand("localize")]
     | Annotated[Info, tyro.conf.subcommand("info")]
     | Annotated[Extract, tyro.conf.subcommand("extract")]
     | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]

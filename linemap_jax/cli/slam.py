@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from linemap_jax.cli.logs import SCANS_EXPLAINED, chunks_of_log, mount_of, opened, progress, warn
+from linemap_jax.cli.logs import SCANS_EXPLAINED, chunks_of_log, mount_of_odometry, odometry_of, opened, progress, warn
 from linemap_jax.cli.mapping import map_of_pieces
 from linemap_jax.cli.options import LogOptions, UsageError, options_of_update
 from linemap_jax.cli.output import check_output, make_folder, say
@@ -29,7 +29,7 @@ DOUBTFUL = 0.4
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Slam(LogOptions):
-    """Build a map and a trajectory from a log with raw odometry: writes map.json, map.png and trajectory.tum."""
+    """Build a map and a trajectory from a log with raw odometry: writes map.json, map.png, trajectory.tum and .csv."""
 
     log: tyro.conf.Positional[Path]
     """CARMEN log, plain or .gz; ROS 1 .bag; ROS 2 bag: its folder, .mcap or .db3."""
@@ -43,15 +43,17 @@ class Slam(LogOptions):
     def run(self) -> int:
         """Track, close loops, map, adjust; and give the exit status."""
         options: dict[str, Any] = options_of_update(self) | {"pose_error": "unknown"}
+        import numpy as np
+
         from linemap_jax.core.settings import Mount
         from linemap_jax.io.map_file import write_map
         from linemap_jax.io.plot import plot_map
-        from linemap_jax.io.tum import write_tum
+        from linemap_jax.io.tum import write_covariances, write_tum
 
-        files = [self.output / name for name in ("map.json", "map.png", "trajectory.tum")]
+        files = [self.output / name for name in ("map.json", "map.png", "trajectory.tum", "trajectory.csv")]
         check_output(self.output, *files, overwrite=self.overwrite)
         log = opened(self, self.log)
-        mount = mount_of(self, log, quiet=self.quiet)
+        mount = mount_of_odometry(self, log)
         with progress(log, quiet=self.quiet):
             slammed, stamps, interrupted = _tracked(self, log, mount)
         warn(log, quiet=self.quiet)
@@ -62,7 +64,9 @@ class Slam(LogOptions):
         again = opened(self, self.log)
         with progress(again, quiet=self.quiet):
             mapped = map_of_pieces(_at_poses(self, again, slammed.trajectory()), at_laser)
-        line_map, _ = slammed.adjust(mapped.line_map, thresholds=options["thresholds"], noise=options["noise"])
+        line_map, cov_keyframes = slammed.adjust(
+            mapped.line_map, thresholds=options["thresholds"], noise=options["noise"]
+        )
         interrupted |= mapped.interrupted
         trajectory = slammed.trajectory()
 
@@ -78,6 +82,8 @@ class Slam(LogOptions):
         plot_map(files[1], line_map, trajectory[:, :2], title=self.log.name, overwrite=self.overwrite)
         poses = trajectory if self.trajectory_frame == "laser" else _of_base(trajectory, mount)
         write_tum(files[2], stamps, poses, overwrite=self.overwrite)
+        covs, doubtful = slammed.cov_trajectory(cov_keyframes), np.concatenate(slammed.shares) < DOUBTFUL
+        write_covariances(files[3], stamps, poses, covs, doubtful, overwrite=self.overwrite)
         if interrupted:
             print(f"linemap: interrupted; map and trajectory so far are in {self.output}", file=sys.stderr)
             return 130
@@ -94,15 +100,14 @@ def _tracked(command: Slam, log: "Log", mount: "Mount") -> tuple["Slammed", "np.
 
     slammed, stamps, interrupted = slam.Slam(), [], False
     on_robot = np.array([mount.x, mount.y, mount.theta], float)
-    laser = next(iter(log)).pose_frame == "laser"
     try:
         for chunk in chunks_of_log(command, log, slam.CHUNK):
-            odometry = np.asarray(chunk.poses.mean, float)
+            odometry = odometry_of(command, chunk)
             if not np.isfinite(odometry).all():
                 raise UsageError(
                     f"{log.path}: has scans without odometry; --standstill does without, --poses takes it from a file"
                 )
-            slammed.add(chunk.scans, odometry if laser else slam.compose(odometry, on_robot))
+            slammed.add(chunk.scans, slam.compose(odometry, on_robot))
             stamps.append(chunk.timestamps)
     except KeyboardInterrupt:
         if not stamps:
@@ -180,7 +185,7 @@ def _summary(
         "lines": int(np.asarray(line_map.lines.valid).sum()),
         "circles": int(np.asarray(line_map.circles.valid).sum()),
         "explained": explained_share(line_map, pieces, Mount(), chunk=CHUNK),
-        **dict(zip(("map", "picture", "trajectory"), map(str, files), strict=True)),
+        **dict(zip(("map", "picture", "trajectory", "covariances"), map(str, files), strict=True)),
     }
 
 
@@ -190,7 +195,8 @@ def _in_words(summary: dict[str, Any]) -> str:
         f"{summary['loops']} loops closed\n"
         f"{summary['lines']} lines, {summary['circles']} circles; {summary['explained']:.1%} of the returns under 20 m "
         "lie within 10 cm of them\n"
-        f"map:        {summary['map']}\n"
-        f"picture:    {summary['picture']}\n"
-        f"trajectory: {summary['trajectory']}"
+        f"map:         {summary['map']}\n"
+        f"picture:     {summary['picture']}\n"
+        f"trajectory:  {summary['trajectory']}\n"
+        f"covariances: {summary['covariances']}"
     )

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jax import export
 
 import linemap_jax
@@ -54,7 +55,9 @@ def kept_program(
         if name not in programs:
             file = folder / name
             program = _read(file)
-            if program is None:
+            if program is not None:
+                _load_lapack()
+            else:
                 program = export.export(jitted)(*args, **kwargs)
                 _write(file, program)
             programs[name] = jax.jit(program.call, compiler_options=compiler_options)
@@ -69,6 +72,12 @@ def _name(function: Callable[..., Any], args: Any, traced: dict[str, Any], stati
     where = (jax.__version__, jax.default_backend(), jax.config.jax_enable_x64, jax.config.jax_default_matmul_precision)  # pyright: ignore[reportAttributeAccessIssue]
     told = repr((_source(), where, structure, kinds, sorted(static.items())))
     return f"{function.__name__}-{_DIGEST(told.encode()).hexdigest()[:32]}.program"
+
+
+@cache
+def _load_lapack() -> None:
+    """Have jax load LAPACK, as it does when it lowers a call of it: a program lowered elsewhere would crash (0.8.3)."""
+    jax.jit(jnp.linalg.inv).lower(jnp.eye(2))
 
 
 @cache

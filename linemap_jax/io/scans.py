@@ -26,6 +26,7 @@ class Chunk(NamedTuple):
     scans: Scan  # [T, N]
     poses: Pose  # [T]; NaN where the log has none
     timestamps: np.ndarray  # [T] s
+    odometry: np.ndarray  # [T, 3] m, m, rad; odometry's poses of the robot, NaN where the log has none beside its poses
 
 
 def chunks_of_readings(
@@ -62,6 +63,7 @@ def chunks_of_readings(
             scans=_scans(batch, width, dtype),
             poses=Pose(mean=jnp.asarray(mean), cov=jnp.asarray(cov.astype(dtype))),
             timestamps=np.array([reading.timestamp for reading in batch]),
+            odometry=np.stack([np.full(3, np.nan) if r.odometry is None else r.odometry for r in batch]),
         )
 
 

@@ -71,3 +71,36 @@ def write_tum(
     text = "".join(f"{t:.6f} {x:.9f} {y:.9f} 0 0 0 {qz:.12f} {qw:.12f}\n" for t, x, y, qz, qw in rows)
     with atomic_write(path, overwrite=overwrite) as temporary:
         temporary.write_text(text, encoding="ascii", newline="\n")
+
+
+def write_covariances(
+    path: str | os.PathLike[str],
+    timestamps: ArrayLike,
+    poses: ArrayLike,
+    covs: ArrayLike,
+    lost: ArrayLike,
+    *,
+    overwrite: bool = False,
+) -> None:
+    """Write what a trajectory has no place for, as a table with a head, one pose a line, fields separated by commas.
+
+    Args:
+      path: of the file.
+      timestamps: s. Shape `[T]`.
+      poses: x, y, theta. m, m, rad. Shape `[T, 3]`.
+      covs: of the poses. m^2, m rad, rad^2. Shape `[T, 3, 3]`.
+      lost: whether the pose is said to be wrong. Shape `[T]`.
+      overwrite: whether an older file may be replaced.
+
+    Raises:
+      OutputError: if the file exists and `overwrite` is false, or if it cannot be written.
+    """
+    upper = np.asarray(covs, float)[:, *np.triu_indices(3)]
+    head = "timestamp,x,y,theta,cov_xx,cov_xy,cov_xtheta,cov_yy,cov_ytheta,cov_thetatheta,lost\n"
+    rows = zip(np.asarray(timestamps, float), np.asarray(poses, float), upper, np.asarray(lost, int), strict=True)
+    text = "".join(
+        f"{t:.6f},{','.join(f'{x:.9f}' for x in pose)},{','.join(f'{c:.9g}' for c in cov)},{is_lost}\n"
+        for t, pose, cov, is_lost in rows
+    )
+    with atomic_write(path, overwrite=overwrite) as temporary:
+        temporary.write_text(head + text, encoding="ascii", newline="\n")

@@ -30,13 +30,13 @@ class OdometryNoise:
     """Error of the distance after one metre, m / sqrt(m)."""
     sigma_distance_turn: Number = 0.03
     """Error of the distance after a turn of one radian, m / sqrt(rad)."""
-    sigma_side_distance: Number = 0.02
+    sigma_side_distance: Number = 0.03
     """Slip to the side after one metre, m / sqrt(m)."""
-    sigma_side_turn: Number = 0.02
+    sigma_side_turn: Number = 0.03
     """Slip to the side after a turn of one radian, m / sqrt(rad)."""
-    sigma_turn_distance: Number = 0.03
+    sigma_turn_distance: Number = 0.05
     """Error of the turn after one metre, rad / sqrt(m)."""
-    sigma_turn_turn: Number = 0.06
+    sigma_turn_turn: Number = 0.1
     """Error of the turn after a turn of one radian, rad / sqrt(rad)."""
 
 

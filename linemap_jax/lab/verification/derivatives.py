@@ -16,6 +16,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from linemap_jax.core import circles, fusion, likelihood, lines, sensor
+from linemap_jax.core.estimation import pose_filter
+from linemap_jax.core.frames import compose, jac_compose_pose, jac_compose_step
 from linemap_jax.core.matching import CircleMatches
 from linemap_jax.core.propagation import product
 from linemap_jax.core.runs import Runs
@@ -550,6 +552,31 @@ def _circle_fusion_cases(random: np.random.Generator) -> Iterator[Case]:
             yield Case(name=f"{place}, {i}", x=np.concatenate([old, old + random.uniform(-0.1, 0.1, 3)]), given=())
 
 
+# --- Section 3: the pose filter -------------------------------------------------------------------------------------
+
+
+def _step_taken(x: Float[Array, "6"]) -> Float[Array, "3"]:
+    """Of a pose and a step, one after the other."""
+    return compose(x[:3], x[3:])
+
+
+def _step_by_both(x: Float[Array, "6"]) -> Float[Array, "3 6"]:
+    return jnp.concatenate([jac_compose_pose(x[:3], x[3:]), jac_compose_step(x[:3], x[3:])], 1)
+
+
+def _step_cases(random: np.random.Generator) -> Iterator[Case]:
+    for name, pose, measurement, mount in _cases_of_points(random):
+        reach, turn = measurement
+        step = np.array([reach, mount[1], turn])
+        yield Case(name=name, x=np.concatenate([pose, step]), given=())
+
+
+def _beacon_cases(random: np.random.Generator) -> Iterator[Case]:
+    """The places that beams of some length end at: near the robot, far from it, all around it."""
+    for name, pose, measurement, mount in _cases_of_points(random):
+        yield Case(name=name, x=pose, given=(literals.point(pose, measurement, mount), mount))
+
+
 # --- The registry ---------------------------------------------------------------------------------------------------
 
 _of_points: dict[str, Any] = {
@@ -657,5 +684,25 @@ DERIVATIVES: tuple[Derivative, ...] = (
         model=literals.fused_circle,
         literal=literals.jac_fused_circle,
         cases=_circle_fusion_cases,
+    ),
+    Derivative(
+        name="pose by pose and step",
+        estimate=_step_taken,
+        analytic=_step_by_both,
+        autodiff=jax.jacfwd(_step_taken),
+        model=lambda x: literals.step_taken(x[:3], x[3:]),
+        literal=lambda x: literals.step_by_pose_and_step(x[:3], x[3:]),
+        angle=2,
+        cases=_step_cases,
+    ),
+    Derivative(
+        name="beacon by pose",
+        estimate=pose_filter.beacon_from_pose,
+        analytic=pose_filter.jac_beacon_pose,
+        autodiff=jax.jacfwd(pose_filter.beacon_from_pose),
+        model=literals.beacon,
+        literal=literals.beacon_by_pose,
+        angle=1,
+        cases=_beacon_cases,
     ),
 )

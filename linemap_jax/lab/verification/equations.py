@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from linemap_jax.core import circles, fusion, likelihood, lines, matching, runs, sensor
+from linemap_jax.core.estimation import pose_filter
 from linemap_jax.core.segmentation import incremental
 from linemap_jax.core.settings import PAPER_RULES, PAPER_THRESHOLDS, SensorNoise, Thresholds
 from linemap_jax.lab.verification import cases, derivatives, literals
@@ -90,7 +91,8 @@ def verify(found: Sequence[Agreement] | None = None, *, seed: int = 0) -> tuple[
       seed: of the random inputs.
 
     Returns:
-      A row for each of the equations (1)-(25), and one for each erratum that stands in no equation.
+      A row for each of the equations (1)-(25), one for the pose filter, and one for each erratum that stands in no
+      equation.
     """
     with jax.enable_x64(True):
         found = derivatives.check_derivatives(seed) if found is None else found
@@ -103,6 +105,7 @@ def verify(found: Sequence[Agreement] | None = None, *, seed: int = 0) -> tuple[
             *_circles(found),
             *_matching(sample),
             *_fusion(found, sample),
+            *_pose_filter(found),
             *_beside_the_equations(),
         )
     return tuple(sorted(rows, key=lambda row: int(row.equation) if row.equation.isdigit() else 99))
@@ -584,6 +587,21 @@ def _fusion(found: Sequence[Agreement], sample: Sample) -> tuple[Row, ...]:
                 Check("mean of old and new, m", _most(mean - (old + new) / 2)),
                 Check("with x_cn twice, m", _most(mean - (old + twice_x) / 2), 0.1, differs=True),
             ),
+        ),
+    )
+
+
+def _pose_filter(found: Sequence[Agreement]) -> tuple[Row, ...]:
+    """Section 3."""
+    return (
+        Row(
+            equation="s3",
+            title="the Kalman filter of the pose",
+            where=(pose_filter.predict, pose_filter.update_by_beacons),
+            verdict="exact",
+            sentence="Cited, not printed. Here: the extended Kalman filter of (x, y, theta), predicted by odometry, "
+            "updated by range and bearing of beacons.",
+            checks=of_derivatives(found, "pose by pose and step", "beacon by pose"),
         ),
     )
 

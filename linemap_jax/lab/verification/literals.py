@@ -215,3 +215,39 @@ def _sums(
 
 def _regressor_first(xy: Float[np.ndarray, "2 ..."], steep: Flag) -> Float[np.ndarray, "2 ..."]:
     return xy[::-1] if steep else xy
+
+
+def step_taken(pose: Three, step: Three) -> Three:
+    """Section 3: the pose after a step seen from a pose."""
+    x, y, theta = pose
+    dx, dy, turn = step
+    c, s = np.cos(theta), np.sin(theta)
+    return np.array([x + c * dx - s * dy, y + s * dx + c * dy, theta + turn])
+
+
+def step_by_pose_and_step(pose: Three, step: Three) -> Float[np.ndarray, "3 6"]:
+    """Its derivative by the pose, and beside it that by the step."""
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    lever = [-s * step[0] - c * step[1], c * step[0] - s * step[1]]
+    return np.array([[1, 0, lever[0], c, -s, 0], [0, 1, lever[1], s, c, 0], [0, 0, 1, 0, 0, 1]])
+
+
+def beacon(pose: Three, place: Two, mount: Three) -> Two:
+    """Section 3: range and bearing of a beacon from a sensor on the robot."""
+    x, y, theta = pose
+    c, s = np.cos(theta), np.sin(theta)
+    dx, dy = place[0] - x - c * mount[0] + s * mount[1], place[1] - y - s * mount[0] - c * mount[1]
+    bearing = np.arctan2(dy, dx) - theta - mount[2]
+    return np.array([np.hypot(dx, dy), (bearing + np.pi) % (2 * np.pi) - np.pi])
+
+
+def beacon_by_pose(pose: Three, place: Two, mount: Three) -> Float[np.ndarray, "2 3"]:
+    """Its derivative by the pose: that of the quotient and of the root, by the chain rule from dx and dy."""
+    x, y, theta = pose
+    c, s = np.cos(theta), np.sin(theta)
+    dx, dy = place[0] - x - c * mount[0] + s * mount[1], place[1] - y - s * mount[0] - c * mount[1]
+    by_theta = np.array([s * mount[0] + c * mount[1], -c * mount[0] + s * mount[1]])
+    ray = np.array([[-1, 0, by_theta[0]], [0, -1, by_theta[1]]])
+    square = dx * dx + dy * dy
+    outer = np.array([[dx / np.sqrt(square), dy / np.sqrt(square)], [-dy / square, dx / square]])
+    return outer @ ray - np.array([[0, 0, 0], [0, 0, 1]])

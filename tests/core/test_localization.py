@@ -1,0 +1,160 @@
+"""Localisation: its update against a joint Kalman filter in NumPy, its sightings against the truth."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from maps import lines_between, poles_at
+
+from linemap_jax.core.estimation.likelihood_field import distances, field_of_map, search
+from linemap_jax.core.estimation.localization import Belief, Sightings, jac_line_pose, place, predict, update
+from linemap_jax.core.estimation.odometry import OdometryNoise, cov_step
+from linemap_jax.core.frames import jac_compose_pose, jac_compose_step
+from linemap_jax.core.state import LineMap
+
+SLOTS, COUNT = 5, 4
+UPDATE, PREDICT = jax.jit(update), jax.jit(predict)
+
+
+def belief(random: np.random.Generator, *, by_map: float = 0.02) -> Belief:
+    root = random.standard_normal((3, 3)) * 0.05
+    return Belief(
+        mean=jnp.array([1.0, 2.0, 0.3]),
+        cov_own=jnp.asarray(root @ root.T + 1e-4 * np.eye(3)),
+        by_map=jnp.asarray(by_map * random.standard_normal((3, SLOTS, 2))),
+        fit=jnp.asarray(0.9),
+        lost=jnp.asarray(False),
+    )
+
+
+def sightings(random: np.random.Generator, slots: list[int]) -> Sightings:
+    n = len(slots)
+    root = 0.02 * random.standard_normal((n, 2, 2))
+    return Sightings(
+        slot=jnp.asarray(slots, jnp.int32),
+        innovation=jnp.asarray(0.05 * random.standard_normal((n, 2))),
+        jac_pose=jnp.asarray(random.standard_normal((n, 2, 3))),
+        by_map=jnp.asarray(0.03 * random.standard_normal((n, 2, 2))),
+        cov=jnp.asarray(root @ np.swapaxes(root, -1, -2) + 1e-4 * np.eye(2)),
+        valid=jnp.ones(n, bool),
+    )
+
+
+def joint_filter(before: Belief, seen: Sightings, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Schmidt's filter by its definition: pose and all errors of the map in one state, the gain of the map struck out.
+
+    Gives the mean, the covariance of the pose, its covariance with the errors of the map, and the NIS.
+    """
+    b = np.asarray(before.by_map).reshape(3, -1)
+    m = b.shape[1]
+    cov = np.block([[np.asarray(before.cov_own) + b @ b.T, b], [b.T, np.eye(m)]])
+    n = len(seen.slot)
+    h = np.zeros((2 * n, 3 + m))
+    for i, slot in enumerate(np.asarray(seen.slot)):
+        rows = slice(2 * i, 2 * i + 2)
+        h[rows, :3] = seen.jac_pose[i]
+        h[rows, 3 + 2 * slot : 5 + 2 * slot] = seen.by_map[i]
+    noise = np.zeros((2 * n, 2 * n))
+    for i in range(n):
+        noise[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = seen.cov[i]
+    y = np.asarray(seen.innovation).ravel() - h[:, :3] @ (at - np.asarray(before.mean))
+    s = h @ cov @ h.T + noise
+    gain = cov @ h.T @ np.linalg.inv(s)
+    gain[3:] = 0
+    left = np.eye(3 + m) - gain @ h
+    after = left @ cov @ left.T + gain @ noise @ gain.T
+    return np.asarray(before.mean) - (gain @ y)[:3], after[:3, :3], after[:3, 3:], float(y @ np.linalg.solve(s, y))
+
+
+def test_an_update_is_that_of_a_joint_filter_that_leaves_the_map_alone() -> None:
+    """One line seen twice in a scan, and again in the next one; linearised beside the mean."""
+    random = np.random.default_rng(3)
+    now = belief(random)
+    for slots in ([0, 2, 2, 4], [2, 0, 1, 1]):
+        seen, at = sightings(random, slots), np.asarray(now.mean) + [0.03, -0.02, 0.01]
+        mean, cov, with_map, nis = joint_filter(now, seen, at)
+        now, found_nis = UPDATE(now, jnp.asarray(at), seen)
+        np.testing.assert_allclose(now.mean, mean, atol=1e-12)
+        np.testing.assert_allclose(now.cov, cov, atol=1e-14)
+        np.testing.assert_allclose(now.by_map.reshape(3, -1), with_map, atol=1e-14)
+        np.testing.assert_allclose(found_nis, nis, rtol=1e-10)
+
+
+def test_a_wall_seen_a_thousand_times_is_no_better_known_than_the_map_knows_it() -> None:
+    """The robot stands: its pose ends with the error of the map, not with less; float32 stands it too."""
+    random = np.random.default_rng(4)
+    for dtype, slack in ((jnp.float64, 1e-6), (jnp.float32, 1e-3)):
+        now, seen = belief(random, by_map=0.0), sightings(random, [0, 1, 2, 3])
+        now = dataclasses.replace(now, cov_own=jnp.eye(3))
+        walls = dataclasses.replace(
+            seen,
+            innovation=jnp.zeros((4, 2)),
+            jac_pose=jnp.tile(jnp.array([[[1.0, 0, 0], [0, 0, 1.0]], [[0, 1.0, 0], [0, 0, 1.0]]]), (2, 1, 1)),
+            by_map=jnp.tile(jnp.diag(jnp.array([0.05, 0.01]))[None], (4, 1, 1)),
+        )
+        now, walls = jax.tree.map(
+            lambda x, to=dtype: x.astype(to) if jnp.issubdtype(x.dtype, jnp.floating) else x, (now, walls)
+        )
+        after = jax.jit(
+            lambda b, s: jax.lax.fori_loop(0, 1000, lambda _, b: update(b, b.mean, s)[0], b), donate_argnums=()
+        )(now, walls)
+        sigma = np.sqrt(np.diag(np.asarray(after.cov, float)))
+        # Two walls for either direction, four for the heading.
+        np.testing.assert_allclose(sigma, [0.05 / np.sqrt(2), 0.05 / np.sqrt(2), 0.01 / 2], rtol=0.02 + slack)
+        assert np.linalg.eigvalsh(np.asarray(after.cov_own, float)).min() > -1e-12
+
+
+def test_a_prediction_moves_what_the_map_has_done() -> None:
+    random = np.random.default_rng(5)
+    before, step = belief(random), jnp.array([0.4, 0.1, -0.2])
+    after = PREDICT(before, step, jnp.array([1e-3, 0.0, 0.0]), OdometryNoise())
+    f, g = (np.asarray(jac(before.mean, step)) for jac in (jac_compose_pose, jac_compose_step))
+    noise = np.asarray(cov_step(step, OdometryNoise())) + np.diag([1e-3, 0, 0])
+    np.testing.assert_allclose(after.cov, f @ np.asarray(before.cov) @ f.T + g @ noise @ g.T, atol=1e-15)
+
+
+def test_how_the_pose_moves_a_line_that_is_fixed_to_the_robot() -> None:
+    """The hand-derived Jacobian against autodiff through the offset and angle at an anchor that stays."""
+    lines = lines_between([[[1.0, 2.0], [3.0, 2.5]], [[-2.0, 0.5], [-1.0, -3.0]]], room=2)
+    lines = dataclasses.replace(lines, offset=jnp.array([0.02, -0.03]))
+    pose, zero = jnp.array([4.0, -1.0, 2.0]), jnp.zeros((3, 3))
+    placed, jac = jax.jit(place)(lines, pose, zero)
+
+    def seen(pose: Any) -> Any:
+        there, _ = place(lines, pose, zero)
+        offset = there.offset + jnp.sum(there.normal * (there.anchor - jax.lax.stop_gradient(placed.anchor)), -1)
+        return jnp.stack([offset, there.angle], -1)
+
+    np.testing.assert_allclose(jac, jax.jit(jax.jacfwd(seen))(pose), atol=1e-13)
+    np.testing.assert_allclose(jac, jac_line_pose(placed, placed.anchor - pose[None, :2]), atol=1e-15)
+
+
+ROOM = LineMap(
+    lines=lines_between([[[0, 0], [6, 0]], [[6, 0], [6, 4]], [[6, 4], [0, 4]], [[0, 4], [0, 0]]]),
+    circles=poles_at([[2.0, 1.0, 0.1]]),
+)
+
+
+def test_the_field_holds_distances_and_the_search_finds_the_pose() -> None:
+    field = jax.jit(field_of_map, static_argnums=1)(ROOM, 256)
+    points = jnp.array([[3.0, 1.5], [5.9, 2.0], [2.0, 1.3], [-0.5, 2.0], [90.0, 2.0]])
+    np.testing.assert_allclose(distances(field, points), [0.98, 0.1, 0.2, 0.5, 1.0], atol=float(field.cell))
+
+    truth = np.array([2.5, 2.2, 0.4])
+    angle = np.linspace(-np.pi, np.pi, 64, endpoint=False) + 0.01
+    c, s = np.cos(angle), np.sin(angle)
+    reach = np.minimum(np.where(c > 0, 6 - truth[0], -truth[0]) / c, np.where(s > 0, 4 - truth[1], -truth[1]) / s)
+    ends = reach[:, None] * np.stack([c, s], -1)
+    turn = np.array([[np.cos(truth[2]), np.sin(truth[2])], [-np.sin(truth[2]), np.cos(truth[2])]])
+    seen = jnp.asarray(ends @ turn.T)
+    root = jnp.diag(jnp.array([0.3, 0.3, 0.1]))
+    find = jax.jit(search, static_argnames="counts")
+    counts = ((13, 25), (7, 9), (7, 9))
+    start = jnp.asarray(truth + [0.35, -0.3, 0.17])
+    found = np.asarray(find(field, seen, jnp.ones(64, bool), start, root, counts=counts))
+    assert np.all(np.abs(found - truth) < [0.05, 0.05, 0.02])
+    # Where nothing was seen, nothing is known better.
+    nothing = find(field, seen, jnp.zeros(64, bool), start, root, counts=counts)
+    np.testing.assert_allclose(nothing, start, atol=1e-9)
