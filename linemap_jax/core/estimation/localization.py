@@ -355,13 +355,17 @@ def locate(
         spread = judged_by.cov
         by_lines = sight_lines(seen, at, spread, lines, thresholds, rules, tracking)
         by_circles = sight_circles(seen, at, spread, line_map.circles, lines.valid.shape[0], tracking)
-        by_points = sight_points(seen, at, seen.alone & (i > 0), lines, noise, tracking)
+        by_points = jax.lax.cond(i > 0, points_from, lambda _: no_points, at)
         sightings = gated(judged_by, _packed([by_lines, by_circles, by_points]), tracking.match_nis)
         after, nis = update(prior, at, sightings)
         return after.mean, after, sightings, nis
 
+    def points_from(at: Float[Array, "3"]) -> Sightings:
+        return sight_points(seen, at, seen.alone, lines, noise, tracking)
+
+    no_points = _no_sightings(min(GROUPS, lines.valid.shape[0]), dtype)
     start = jnp.where(vague, found, belief.mean)
-    carry = (start, judged_by, _no_sightings(dtype), jnp.zeros((), dtype))
+    carry = (start, judged_by, _no_sightings(SIGHTINGS, dtype), jnp.zeros((), dtype))
     _, after, sightings, nis = jax.lax.fori_loop(0, ITERATIONS, look, carry)
 
     fit = fit_of_scan(seen, after.mean, lines, field, tracking)
@@ -760,16 +764,14 @@ def _where(
     return dataclasses.replace(chosen, slot=chosen.slot.astype(jnp.int32))
 
 
-def _no_sightings(dtype: Any) -> Sightings:
-    none = jnp.zeros(SIGHTINGS, bool)
-    two, eye = jnp.zeros((SIGHTINGS, 2), dtype), jnp.zeros((SIGHTINGS, 2, 2), dtype)
+def _no_sightings(count: int, dtype: Any) -> Sightings:
     return _where(
-        none,
-        slot=jnp.zeros(SIGHTINGS, jnp.int32),
-        innovation=two,
-        jac_pose=jnp.zeros((SIGHTINGS, 2, 3), dtype),
-        by_map=eye,
-        cov=eye,
+        jnp.zeros(count, bool),
+        slot=jnp.zeros(count, jnp.int32),
+        innovation=jnp.zeros((count, 2), dtype),
+        jac_pose=jnp.zeros((count, 2, 3), dtype),
+        by_map=jnp.zeros((count, 2, 2), dtype),
+        cov=jnp.zeros((count, 2, 2), dtype),
     )
 
 
