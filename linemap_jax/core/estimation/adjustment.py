@@ -7,7 +7,7 @@ lines, with what correlates them.
 """
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ from linemap_jax.core.estimation.pose_graph import PoseGraph
 from linemap_jax.core.extract import extract
 from linemap_jax.core.frames import between, dot, perp, rotate, unit, wrap_angle
 from linemap_jax.core.matching import best_line, with_sign
-from linemap_jax.core.propagation import inverse, propagate, square_root, symmetric
+from linemap_jax.core.propagation import apply, inverse, propagate, square_root, symmetric
 from linemap_jax.core.settings import Number, SensorNoise, Thresholds
 from linemap_jax.core.state import LineMap, Lines, Pose, Scan, pytree
 
@@ -102,10 +102,10 @@ def residual_of_sighting(
 def adjust(graph: PoseGraph, lines: Lines, sightings: Sightings) -> Adjusted:
     """Poses and lines from steps and sightings.
 
-    A dense system of order 3 N + 2 K: time grows with its cube. Sightings that do not fit are left out; the closures
-    keep the weights that they have in the graph. Where the sightings that are left fit less well than their covariances
-    have it, all covariances are as much larger (the variance of unit weight a posteriori, of adjustment computation).
-    In float64.
+    The lines are eliminated; what is left is dense, of order 3 N, and time grows with its cube. Sightings that do not
+    fit are left out; the closures keep the weights that they have in the graph. Where the sightings that are left fit
+    less well than their covariances have it, all covariances are as much larger (the variance of unit weight a
+    posteriori, of adjustment computation). In float64.
 
     Args:
       graph: keyframes, optimised. The first one is held.
@@ -130,58 +130,58 @@ def adjust(graph: PoseGraph, lines: Lines, sightings: Sightings) -> Adjusted:
     def of_sightings(pose: Array, line: Array, at: Array, anchor: Array, angle: Array, root: Array) -> Array:
         return root @ residual_of_sighting(pose, line, at, anchor, angle)
 
-    def system(poses: Array, state: Array, widening: Number) -> tuple[Array, Array, Array, Array]:
-        """The normal matrix, the right-hand side, which lines are seen, and the variance of unit weight."""
-        matrix = jnp.zeros((3 * n + 2 * k,) * 2, poses.dtype)
-        right = jnp.zeros(3 * n + 2 * k, poses.dtype)
-
+    def system(poses: Array, state: Array, widening: Number) -> _System:
         args = (poses[begin], poses[end], step, root_of_step)
-        matrix, right = _add(
-            matrix,
-            right,
-            (_places(begin, 3, 0), _places(end, 3, 0)),
-            jax.vmap(jax.jacfwd(of_steps, (0, 1)))(*args),
-            jax.vmap(of_steps)(*args),
-            weight_of_step,
+        jac = jnp.concatenate(jax.vmap(jax.jacfwd(of_steps, (0, 1)))(*args), -1)
+        weighted = weight_of_step[:, None, None] * jac
+        places = jnp.concatenate([_places(begin, 3), _places(end, 3)], -1)
+        of_poses = (
+            jnp.zeros((3 * n, 3 * n), poses.dtype).at[places[:, :, None], places[:, None]].add(_mt(weighted) @ jac)
         )
-        args = (
-            poses[sightings.keyframe],
-            state[sightings.line],
-            lines.anchor[sightings.line],
-            sightings.anchor,
-            sightings.angle,
-            root,
-        )
+        pull_poses = jnp.zeros(3 * n, poses.dtype).at[places].add(-_mtv(weighted, jax.vmap(of_steps)(*args)))
+
+        at = (poses[sightings.keyframe], state[sightings.line], lines.anchor[sightings.line])
+        args = (*at, sightings.anchor, sightings.angle, root)
         off = jax.vmap(of_sightings)(*args)
+        by_pose, by_line = jax.vmap(jax.jacfwd(of_sightings, (0, 1)))(*args)
         square = jnp.sum(off**2, -1)
         weight = (sightings.valid & (square < widening * GATE)).astype(poses.dtype)
-        matrix, right = _add(
-            matrix,
-            right,
-            (_places(sightings.keyframe, 3, 0), _places(sightings.line, 2, 3 * n)),
-            jax.vmap(jax.jacfwd(of_sightings, (0, 1)))(*args),
-            off,
-            weight,
-        )
+        of_pose, of_line = (weight[:, None, None] * jac for jac in (by_pose, by_line))
         seen = jnp.zeros(k, bool).at[sightings.line].max(weight > 0)
-        held = jnp.concatenate([jnp.repeat((jnp.arange(n) == 0) | ~graph.valid, 3), jnp.repeat(~seen, 2)])
         redundancy = 2 * jnp.sum(weight) - 3 * jnp.sum(linked) - 2 * jnp.sum(seen)
-        unit_variance = jnp.sum(weight * square) / jnp.maximum(redundancy, 1)
-        return matrix + jnp.diag(jnp.where(held, _HELD, 0)), right, seen, unit_variance
+
+        place, slot = _places(sightings.keyframe, 3), sightings.line
+        of_poses = of_poses.at[place[:, :, None], place[:, None]].add(_mt(of_pose) @ by_pose)
+        held = jnp.repeat((jnp.arange(n) == 0) | ~graph.valid, 3)
+        unseen = jnp.where(seen[:, None, None], 0, _HELD * jnp.eye(2, dtype=poses.dtype)[None])
+        return _System(
+            of_poses=of_poses + jnp.diag(jnp.where(held, _HELD, 0)),
+            of_lines=unseen + jnp.zeros((k, 2, 2), poses.dtype).at[slot].add(_mt(of_line) @ by_line),
+            of_both=jnp.zeros((3 * n, k, 2), poses.dtype).at[place, slot[:, None]].add(_mt(of_pose) @ by_line),
+            pull_poses=pull_poses.at[place].add(-_mtv(of_pose, off)),
+            pull_lines=jnp.zeros((k, 2), poses.dtype).at[slot].add(-_mtv(of_line, off)),
+            seen=seen,
+            unit_variance=jnp.sum(weight * square) / jnp.maximum(redundancy, 1),
+        )
 
     def iterate(at: tuple[Array, Array], widening: Array) -> tuple[tuple[Array, Array], None]:
         poses, state = at
-        matrix, right, *_ = system(poses, state, widening)
-        move = cho_solve(cho_factor(matrix, lower=True), right)
-        return (poses + move[: 3 * n].reshape(n, 3), state + move[3 * n :].reshape(k, 2)), None
+        now = system(poses, state, widening)
+        factor, through = _eliminated(now)
+        move = cho_solve(factor, now.pull_poses - jnp.einsum("pki,ki->p", through, now.pull_lines))
+        rest = now.pull_lines - jnp.einsum("pki,p->ki", now.of_both, move)
+        return (poses + move.reshape(n, 3), state + apply(inverse(now.of_lines), rest)), None
 
     begin_at = (graph.poses, jnp.stack([lines.offset, lines.angle], -1))
     (poses, state), _ = jax.lax.scan(iterate, begin_at, jnp.asarray(WIDENING, graph.poses.dtype))
-    matrix, _, seen, unit_variance = system(poses, state, 1.0)
-    cov = cho_solve(cho_factor(matrix, lower=True), jnp.eye(matrix.shape[0], dtype=matrix.dtype))
-    cov = cov * jnp.maximum(unit_variance, 1)
-    cov_poses = jnp.moveaxis(jnp.diagonal(cov[: 3 * n, : 3 * n].reshape(n, 3, n, 3), axis1=0, axis2=2), -1, 0)
-    cov_lines = jnp.moveaxis(jnp.diagonal(cov[3 * n :, 3 * n :].reshape(k, 2, k, 2), axis1=0, axis2=2), -1, 0)
+    now = system(poses, state, 1.0)
+    factor, through = _eliminated(now)
+    scale = jnp.maximum(now.unit_variance, 1)
+    cov = scale * cho_solve(factor, jnp.eye(3 * n, dtype=poses.dtype))
+    cov_poses = jnp.moveaxis(jnp.diagonal(cov.reshape(n, 3, n, 3), axis1=0, axis2=2), -1, 0)
+    spread = (cov @ through.reshape(3 * n, 2 * k)).reshape(3 * n, k, 2)
+    cov_lines = scale * inverse(now.of_lines) + jnp.einsum("pki,pkj->kij", through, spread)
+    seen = now.seen
     moved = dataclasses.replace(
         lines,
         offset=state[:, 0],
@@ -189,7 +189,7 @@ def adjust(graph: PoseGraph, lines: Lines, sightings: Sightings) -> Adjusted:
         cov_independent=jnp.where(seen[:, None, None], symmetric(cov_lines), lines.cov_independent),
         sqrt_persistent=jnp.where(seen[:, None, None], 0, lines.sqrt_persistent),
     )
-    return Adjusted(poses, symmetric(cov_poses), moved, seen, unit_variance)
+    return Adjusted(poses, symmetric(cov_poses), moved, seen, now.unit_variance)
 
 
 def with_error_of_poses(
@@ -232,22 +232,34 @@ def with_error_of_poses(
     )
 
 
-def _places(index: Int[Array, " F"], size: int, offset: int) -> Int[Array, "F size"]:
-    """Where the unknowns of some poses or lines stand."""
-    return offset + size * index[:, None] + jnp.arange(size)[None]
+class _System(NamedTuple):
+    """Normal equations, in blocks: poses, lines, and what couples them."""
+
+    of_poses: Float[Array, "P P"]  # P = 3 N
+    of_lines: Float[Array, "K 2 2"]
+    of_both: Float[Array, "P K 2"]
+    pull_poses: Float[Array, " P"]
+    pull_lines: Float[Array, "K 2"]
+    seen: Bool[Array, " K"]
+    unit_variance: Float[Array, ""]
 
 
-def _add(
-    matrix: Array,
-    right: Array,
-    places: tuple[Array, Array],
-    jacs: tuple[Array, Array],
-    residual: Float[Array, "F m"],
-    weight: Float[Array, " F"],
-) -> tuple[Array, Array]:
-    """Put what some residuals add into the normal equations."""
-    at = jnp.concatenate(places, -1)
-    jac = jnp.concatenate(jacs, -1)
-    block = jnp.einsum("fmi,f,fmj->fij", jac, weight, jac)
-    pull = -jnp.einsum("fmi,f,fm->fi", jac, weight, residual)
-    return matrix.at[at[:, :, None], at[:, None, :]].add(block), right.at[at].add(pull)
+def _eliminated(system: _System) -> tuple[Any, Float[Array, "P K 2"]]:
+    """The factor of what is left for the poses when each line follows them (Schur), and how it follows."""
+    through = jnp.einsum("pki,kij->pkj", system.of_both, inverse(system.of_lines))
+    p = system.of_poses.shape[0]
+    left = system.of_poses - through.reshape(p, -1) @ system.of_both.reshape(p, -1).T
+    return cho_factor(left, lower=True), through
+
+
+def _places(index: Int[Array, " F"], size: int) -> Int[Array, "F size"]:
+    """Where the unknowns of some poses stand."""
+    return size * index[:, None] + jnp.arange(size)[None]
+
+
+def _mt(matrix: Float[Array, "F m n"]) -> Float[Array, "F n m"]:
+    return jnp.swapaxes(matrix, -1, -2)
+
+
+def _mtv(matrix: Float[Array, "F m n"], vector: Float[Array, "F m"]) -> Float[Array, "F n"]:
+    return jnp.sum(matrix * vector[..., None], -2)
