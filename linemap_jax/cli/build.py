@@ -63,7 +63,7 @@ class Build(LogOptions):
             "log": self.log.name,
             "preset": self.preset,
             "pose_sigma": self.pose_sigma,
-            **{name: option for name, option in options.items() if name != "segmentation"},
+            **options,
         }
         if before is not None:
             if told := differences(before.settings, settings):

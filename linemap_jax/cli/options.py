@@ -101,11 +101,11 @@ def options_of_update(command: LogOptions) -> dict[str, Any]:
     options["noise"] = dataclasses.replace(options["noise"], **given)
     if command.covariance is not None:
         options["covariance"] = command.covariance
-    return (
-        options
-        | {"jacobians": command.jacobians, "segmentation": command.segmentation}
-        | ({} if command.max_vertices is None else {"max_vertices": command.max_vertices})
-    )
+    return options | {
+        "jacobians": command.jacobians,
+        "segmentation": command.segmentation,
+        "max_vertices": command.max_vertices,
+    }
 
 
 def options_of_method(

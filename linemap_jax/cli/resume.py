@@ -11,6 +11,7 @@ START_CAPACITY = (1024, 512)
 """Slots for lines and circles to begin with. To grow costs a compilation, and most buildings fit into these."""
 
 COMPARED = ("preset", "pose_error", "covariance", "pose_sigma", "thresholds", "noise", "rules", "persistence", "mount")
+COMPARED += ("segmentation", "max_vertices")
 """What of the settings decides what a map is."""
 MOST_TOLD = 4
 """Differences that are told one by one."""

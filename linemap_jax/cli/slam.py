@@ -76,7 +76,7 @@ class Slam(LogOptions):
             "preset": self.preset,
             "pose_sigma": self.pose_sigma,
             "slam": {"keyframes": len(slammed.keyframes), "loops": slammed.closures},
-            **{name: option for name, option in at_laser.items() if name != "segmentation"},
+            **at_laser,
         }
         write_map(files[0], line_map, settings, overwrite=self.overwrite)
         plot_map(files[1], line_map, trajectory[:, :2], title=self.log.name, overwrite=self.overwrite)

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from linemap_jax.core.state import LineMap
 from linemap_jax.io.atomic import atomic_write
-from linemap_jax.io.shapes import LEVEL, half_axes, shapes_of_map, used
+from linemap_jax.io.shapes import LEVEL, finite_path, half_axes, shapes_of_map, used
 
 LAYERS = {"LINES": 5, "BANDS": 30, "CIRCLES": 4, "ELLIPSES": 40, "PATH": 8}
 """Names of the layers, and their colours: numbers of AutoCAD's table."""
@@ -53,8 +53,7 @@ def write_dxf(
     for center, (minor, major) in zip(circles.center[circles.fitted].tolist(), axes.swapaxes(1, 2), strict=True):
         ratio = float(np.linalg.norm(minor) / np.linalg.norm(major))
         space.add_ellipse(center, major.tolist(), max(ratio, _THINNEST), dxfattribs={"layer": "ELLIPSES"})
-    driven = np.zeros((0, 2)) if trajectory is None else np.asarray(trajectory, float)
-    if len(driven := driven[np.isfinite(driven).all(1)]):
+    if len(driven := finite_path(trajectory)):
         space.add_lwpolyline(driven.tolist(), dxfattribs={"layer": "PATH"})
     with atomic_write(path, overwrite=overwrite) as temporary:
         document.saveas(temporary)

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 
 from linemap_jax.core.state import Circles, LineMap, Lines
 from linemap_jax.io.atomic import atomic_write
-from linemap_jax.io.shapes import Floats, ellipses, line_bands, outlines, segments, used
+from linemap_jax.io.shapes import Floats, ellipses, finite_path, line_bands, outlines, segments, used
 
 DPI = 200
 LARGEST = np.array([9.0, 7.0])
@@ -71,10 +71,7 @@ def draw_map(line_map: LineMap, trajectory: ArrayLike | None = None, *, title: s
     """The picture of `plot_map` as a figure, to show or to save otherwise; pyplot does not know of it."""
     if not 0 < level < 1:
         raise ValueError(f"level must be between 0 and 1, not {level}")
-    path = np.zeros((0, 2)) if trajectory is None else np.asarray(trajectory, float)
-    if path.ndim != 2 or path.shape[1] != 2:
-        raise ValueError(f"trajectory must be of shape [T, 2], not {path.shape}")
-    path = path[np.isfinite(path).all(1)]
+    path = finite_path(trajectory)
 
     lines, circles = used(line_map.lines), used(line_map.circles)
     ends = segments(lines)

@@ -36,6 +36,18 @@ class Shapes(NamedTuple):
     circle_times: NDArray[np.int32]  # [C]
 
 
+def finite_path(trajectory: ArrayLike | None) -> Floats:
+    """The positions of a trajectory that are known, `[T, 2]` in metres; none of None.
+
+    Raises:
+      ValueError: if the trajectory is not of shape `[T, 2]`.
+    """
+    path = np.zeros((0, 2)) if trajectory is None else np.asarray(trajectory, float)
+    if path.ndim != 2 or path.shape[1] != 2:
+        raise ValueError(f"trajectory must be of shape [T, 2], not {path.shape}")
+    return path[np.isfinite(path).all(1)]
+
+
 def shapes_of_map(
     line_map: LineMap, level: float = LEVEL, *, band_steps: int = BAND_STEPS, circle_steps: int = CIRCLE_STEPS
 ) -> Shapes:

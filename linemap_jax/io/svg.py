@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from linemap_jax.core.state import LineMap
 from linemap_jax.io.atomic import atomic_write
-from linemap_jax.io.shapes import LEVEL, Floats, shapes_of_map
+from linemap_jax.io.shapes import LEVEL, Floats, finite_path, shapes_of_map
 
 SCALE = 100
 """One to so many, on paper."""
@@ -53,8 +53,7 @@ def write_svg(
       OutputError: if the file exists and `overwrite` is false, or cannot be written.
     """
     shapes = shapes_of_map(line_map, level)
-    driven = np.zeros((0, 2)) if trajectory is None else np.asarray(trajectory, float)
-    driven = driven[np.isfinite(driven).all(1)]
+    driven = finite_path(trajectory)
     reach = shapes.radius[:, None]
     parts = (shapes.segments, shapes.bands, shapes.center - reach, shapes.center + reach, driven)
     points = np.concatenate([np.zeros((0, 2)), *(part.reshape(-1, 2) for part in parts)])

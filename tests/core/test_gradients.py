@@ -99,7 +99,7 @@ def test_gradients_of_an_extraction_are_finite(name: str, jacobians: str) -> Non
             assert np.any(found[1].mean != 0) == seen, which
 
 
-@pytest.mark.parametrize("name", ["default"])  # "paper" goes the same way through less, and takes as long to compile
+@pytest.mark.parametrize("name", ["default", "paper"])  # which wipe by beams, and by triangles
 def test_gradients_of_a_map_are_finite(name: str) -> None:
     """In forward mode: wiping loops over as many lines as are cut, which has no reverse."""
     # Not optimised at all, XLA (jax 0.8.3) reads one number of this program twice, and the second time as NaN.

@@ -9,30 +9,16 @@ import tracemalloc
 import numpy as np
 import pytest
 from bags import UPSIDE_DOWN, Recording, heading, single_file
+from logs import read, refused
 
 from linemap_jax.io.bags import MAX_WAIT, covariance_in_the_plane
 from linemap_jax.io.frames import Standstill, Trajectory
-from linemap_jax.io.log import RANGE_MAX, LogError, Notes, Reading, open_log
+from linemap_jax.io.log import RANGE_MAX, LogError, open_log
 
 KINDS = ["bag", "bag-lz4", "bag-bz2", "db3", "db3-zstd", "mcap", "mcap-zstd"]
 RANGES = [1.0, 2.0, 3.0, math.inf, -math.inf, math.nan, 0.0]
 AHEAD = heading(0.1)
 COV = np.diag([0.01, 0.02, 1e6, 1e6, 1e6, 0.003])
-
-
-def read(path, **options) -> tuple[list[Reading], Notes]:
-    log = open_log(path, **options)
-    return list(log), log.notes
-
-
-def refused(path, **options) -> str:
-    """The sentence with which a log is refused; it names the file and is one line."""
-    with pytest.raises(LogError) as caught:
-        list(open_log(path, **options))
-    sentence = str(caught.value)
-    assert str(path) in sentence
-    assert "\n" not in sentence
-    return sentence
 
 
 def assert_poses(found, expected) -> None:

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from logs import read, refused
 
 from linemap_jax.io.carmen import MAX_LINE, assumed_sweep
 from linemap_jax.io.frames import Trajectory
-from linemap_jax.io.log import RANGE_MAX, LogError, Notes, Reading, open_log
+from linemap_jax.io.log import RANGE_MAX, LogError, Notes, open_log
 
 DATA = Path(os.environ.get("LINEMAP_DATA", Path(__file__).parents[2] / "../shared/data")) / "carmen"
 POSE = (1.0, 2.0, 0.5)
@@ -54,24 +55,9 @@ def write(tmp_path):
     return write
 
 
-def read(path, **options) -> tuple[list[Reading], Notes]:
-    log = open_log(path, **options)
-    return list(log), log.notes
-
-
 def told(notes: Notes) -> list[str]:
     """The warnings, without the one that the few beams of these tests have no known sweep."""
     return [warning for warning in notes.warnings() if warning not in notes.assumptions]
-
-
-def refused(path, **options) -> str:
-    """The sentence with which a log is refused; it names the file and is one line."""
-    with pytest.raises(LogError) as caught:
-        list(open_log(path, **options))
-    sentence = str(caught.value)
-    assert str(path) in sentence
-    assert "\n" not in sentence
-    return sentence
 
 
 # The message forms
