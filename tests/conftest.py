@@ -1,7 +1,7 @@
 """How the tests run: on the CPU, in float64 unless a test says otherwise, every annotated shape checked at run time."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 # Before jax is loaded. The log level hides what jaxlib prints, at level "error", whenever it reads its cache.
@@ -35,6 +35,7 @@ LONGEST = (
     "test_notebooks",
     "test_consistency",
     "test_cli",
+    "test_cli_slam",
     "test_gradients",
     "test_trials",
     "test_readme",
@@ -45,6 +46,17 @@ LONGEST = (
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The longest files first; else as they were."""
     items.sort(key=lambda item: LONGEST.index(item.path.stem) if item.path.stem in LONGEST else len(LONGEST))
+
+
+@pytest.fixture
+def jax_as_it_was(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """The command line sets up jax for its process; and its cache of compilations is not the user's."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "cache"))
+    names = "jax_enable_x64", "jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs"
+    before = {name: getattr(jax.config, name) for name in names}
+    yield
+    for name, value in before.items():
+        jax.config.update(name, value)
 
 
 @pytest.fixture(scope="session")

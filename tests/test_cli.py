@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 import pytest
 from bags import Recording
@@ -27,22 +26,7 @@ BEARINGS = np.deg2rad(np.arange(BEAMS) - 90.0)
 WEST, SOUTH, EAST, NORTH = -2.0, -3.0, 6.0, 3.0  # m: a room
 POLE = np.array([3.0, 1.0, 0.13])  # m: x, y, radius
 
-
-@pytest.fixture(autouse=True)
-def _as_it_was(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """The command line sets up jax for its process; and its cache of compilations is not the user's."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "cache"))
-    before = {
-        name: getattr(jax.config, name)
-        for name in (
-            "jax_enable_x64",
-            "jax_compilation_cache_dir",
-            "jax_persistent_cache_min_compile_time_secs",
-        )
-    }
-    yield
-    for name, value in before.items():
-        jax.config.update(name, value)
+pytestmark = pytest.mark.usefixtures("jax_as_it_was")
 
 
 def ranges_at(x: float, y: float, rng: np.random.Generator) -> np.ndarray:

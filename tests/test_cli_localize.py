@@ -1,11 +1,9 @@
 """`linemap localize`: a drive through a room that the map knows, and on into one that it does not."""
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 import pytest
 from maps import lines_between, poles_at
@@ -23,16 +21,7 @@ CORNERS = np.array([(0, 0), (7, 0), (7, 3), (4, 3), (4, 6), (0, 6)], float)
 BOX = np.array([(5.5, 0.8), (6.2, 0.8), (6.2, 1.5), (5.5, 1.5)])
 HALL = np.array([(-5, -9), (9, -11), (13, 2), (6, 12), (-5, 10)], float)
 
-
-@pytest.fixture(autouse=True)
-def _as_it_was(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """The command line sets up jax for its process; and its cache of compilations is not the user's."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "cache"))
-    names = "jax_enable_x64", "jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs"
-    before = {name: getattr(jax.config, name) for name in names}
-    yield
-    for name, value in before.items():
-        jax.config.update(name, value)
+pytestmark = pytest.mark.usefixtures("jax_as_it_was")
 
 
 def walls(*polygons: np.ndarray) -> np.ndarray:

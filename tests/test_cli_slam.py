@@ -22,6 +22,8 @@ from linemap_jax.lab.simulate import simulate
 
 SCANS = 400
 
+pytestmark = pytest.mark.usefixtures("jax_as_it_was")
+
 
 class Drive:
     """A log, and the truth of it."""
@@ -66,9 +68,8 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
 
 
 @pytest.fixture
-def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., Any]:
+def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., Any]:
     """Runs the command line in this process; gives the exit status, and what stands on stdout and stderr."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
     def run(*args: Any) -> tuple[int, str, str]:
         capsys.readouterr()
