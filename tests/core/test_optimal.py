@@ -96,7 +96,7 @@ def sweep_of(ranges: jax.Array, spacing: float, sigma: float, price: float) -> S
         weight=ones / sigma,
         price=price * ones,
         follows=jnp.arange(n) > 0,
-        counts=ones,
+        again=ones < 0,
         valid=ones > 0,
     )
 

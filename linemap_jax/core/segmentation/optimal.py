@@ -84,7 +84,7 @@ def _by_criterion(points: Points, thresholds: Thresholds, noise: SensorNoise) ->
         weight=one / noise.range_sigma,
         price=one * thresholds.line_sigmas**2,
         follows=near & adjacent,
-        counts=one,
+        again=jnp.zeros_like(near),
         valid=points.valid,
     )
     price = 2 * jnp.log(jnp.maximum(jnp.sum(points.valid), 2).astype(one.dtype))
@@ -134,7 +134,7 @@ def _by_budget(points: Points, noise: SensorNoise, max_vertices: int) -> Segment
             weight=jnp.where(pinned, PINNED, 1).astype(dtype),
             price=jnp.broadcast_to(price, place.shape),
             follows=jnp.where(opened, place > 0, follows[straight]),
-            counts=jnp.where(again, 0, 1).astype(dtype),
+            again=again,
             valid=valid,
         )
 
