@@ -19,6 +19,7 @@ residual sum grows by squares, and whose determinant by terms that are not negat
 """
 
 import dataclasses
+import functools
 import math
 from typing import NamedTuple
 
@@ -26,14 +27,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from linemap_jax.core.slots import first_true
 from linemap_jax.core.state import pytree
 
 MOST_ANGLE = 3.0
 """Largest angle that one line spans, rad: below half a turn."""
 LEAST_SINE = math.sin(MOST_ANGLE)
-STARTS = 128
-"""Where lines may start that are still looked at; see `_Start`."""
+STARTS = 96
+"""Points where a line may start that are looked at side by side. The one that promises least gives way to the next; a
+scan of no more points is searched whole, and of others hardly one comes out differently. A multiple of `FOLD`."""
+FOLD = 32
+"""XLA makes two loops of a minimum over more than so many numbers."""
 LEAST_STEP = 0.15
 """Vertices stay so many beam spacings apart."""
 ITERATIONS = 25
@@ -59,7 +62,7 @@ class Sweep:
 class _Start(NamedTuple):
     """A point where a line may start: at a vertex, on its beam."""
 
-    index: Array
+    place: Array  # in the sweep
     cos: Array  # of its angle
     sin: Array
     inverse: Array  # 1/r
@@ -117,10 +120,9 @@ def best_polyline(
     n, dtype = sweep.range.shape[0], sweep.range.dtype
     budget = max_vertices is not None
     width = max_vertices + 1 if budget else 1  # costs of at most so many vertices
-    count = min(n, STARTS)
     penalty = jnp.zeros((), dtype) if budget else jnp.asarray(vertex_price, dtype)
     infinite = jnp.asarray(jnp.inf, dtype)
-    slot = jnp.arange(count, dtype=jnp.int32)
+    slot = jnp.arange(STARTS, dtype=jnp.int32)
     index = jnp.arange(n, dtype=jnp.int32)
 
     def later(rows: Array, by: int) -> Array:
@@ -134,7 +136,7 @@ def best_polyline(
     inverse = 1 / jnp.where(sweep.valid, sweep.range, 1)
     weight = (sweep.weight * sweep.range**2) ** 2
     points = _Start(
-        index=index, cos=jnp.cos(sweep.angle), sin=jnp.sin(sweep.angle), inverse=inverse, variance=1 / weight
+        place=index, cos=jnp.cos(sweep.angle), sin=jnp.sin(sweep.angle), inverse=inverse, variance=1 / weight
     )
     ordinal = index - sweep.again
 
@@ -150,7 +152,7 @@ def best_polyline(
         # The point before is one more start; the others see one more point.
         newest = slot == free
         c, s = _turn(start, point)
-        fit = _observe(fit, c, s, range_, point.inverse, weight, tangent_weight, start.index < point.index - 2)
+        fit = _observe(fit, c, s, range_, point.inverse, weight, tangent_weight)
         fit = fit._replace(rss=jnp.where(follows & ((c > 0) | (s > LEAST_SINE)), fit.rss, infinite))
         start, fit = (
             jax.tree.map(lambda new, old: jnp.where(newest, new, old), *pair)
@@ -159,7 +161,7 @@ def best_polyline(
         past = jax.tree.map(lambda new, old: jnp.where(newest[None], new[:, None], old), latest, past)
 
         # What a line from each start to this point costs
-        size = ordinal - start.index
+        size = ordinal - start.place
 
         def joined(value: Array, variance: Array, least: int) -> Array:
             """Shape `[W, K]` or `[1, K]`."""
@@ -201,15 +203,15 @@ def best_polyline(
         excess = jnp.min(jnp.where(cost[:, None] < infinite, each - cost[:, None], infinite), 0)
         excess = jnp.where(size < min_points, 0, excess) + penalty / 3 * jnp.log(size.astype(dtype))
         promise = _in_order(jnp.where(fit.rss < infinite, excess, infinite))
-        free = first_true(promise == jnp.max(promise))
-        return (start, past, fit, latest, so_far, free), (at.index, is_corner, is_end, here)
+        free = _minimum(jnp.where(promise == -_minimum(-promise), slot, STARTS))
+        return (start, past, fit, latest, so_far, free), (4 * at.place + 2 * is_corner + is_end, here)
 
-    zero = jnp.zeros(count, dtype)
-    one = jnp.ones((width, count), dtype)
+    zero = jnp.zeros(STARTS, dtype)
+    one = jnp.ones((width, STARTS), dtype)
     fits = _first_fit(points, weight)
     fits = fits._replace(rss=jnp.where(sweep.follows & (index > 0), fits.rss, infinite))
     carry = (
-        _Start(*[zero] * 5)._replace(index=jnp.zeros(count, jnp.int32)),
+        _Start(*[zero] * 5)._replace(place=jnp.zeros(STARTS, jnp.int32)),
         _Past(*[one] * 4),
         _Fit(*[zero] * 7)._replace(rss=zero + infinite),
         _Past(*[one[:, 0]] * 4),
@@ -218,44 +220,44 @@ def best_polyline(
     )
     before = jax.tree.map(_before, points)
     xs = (points, ordinal, before, fits, sweep.range, weight, sweep.follows, sweep.price, sweep.valid)
-    (_, _, _, _, so_far, _), choices = jax.lax.scan(step, carry, xs)
+    values: Array
+    (*_, so_far, _), (choices, values) = jax.lax.scan(step, carry, xs)
     vertices = jnp.asarray((max_vertices if within is None else within) if budget else 0, jnp.int32)
-    kind, value = _walked_back(choices, vertices, budget=budget)
+    kind, which = _walked_back(choices, vertices, budget=budget)
     kind = jnp.where(sweep.valid, kind, LEFT)
-    return kind, jnp.where(kind == BEGIN, inverse, value), so_far[vertices]
+    return kind, jnp.where(kind == BEGIN, inverse, values[index, which]), so_far[vertices]
 
 
 def _walked_back(
-    choices: tuple[Array, Array, Array, Array], vertices: Int[Array, ""], *, budget: bool
-) -> tuple[Int[Array, " N"], Float[Array, " N"]]:
-    """What each point is to the cheapest polyline of some vertices, and the inverse range there.
+    choices: Int[Array, "N W"], vertices: Int[Array, ""], *, budget: bool
+) -> tuple[Int[Array, " N"], Int[Array, " N"]]:
+    """What each point is to the cheapest polyline, and how many vertices there are up to it.
 
     Args:
-      choices: of each point, by the number of vertices, `[N, W]`: where the cheapest line to it starts; whether that
-        is a corner; whether the cheapest polyline up to the point ends with it; and its inverse range.
+      choices: by the number of vertices, four times where the cheapest line to the point starts; 2 more if that is a
+        corner; 1 more if the cheapest polyline up to the point ends with that line.
       vertices: how many there may be.
       budget: whether they are counted.
     """
 
     def step(carry: tuple, x: tuple) -> tuple[tuple, tuple]:
         vertices, in_chain, goal, goal_joined = carry
-        index, start, is_corner, is_end, value = x
-        ends = ~in_chain & is_end[vertices]
+        index, choice = x
+        ends = ~in_chain & (choice[vertices] % 2 > 0)
         at_goal = in_chain & (index == goal)
         at_corner, at_begin = at_goal & goal_joined, at_goal & ~goal_joined
         kind = jnp.where(in_chain, INSIDE, LEFT)
         kind = jnp.where(ends, END, jnp.where(at_corner, CORNER, jnp.where(at_begin, BEGIN, kind)))
-        vertices = vertices - (at_corner if budget else 0)
-        renew = ends | at_corner
-        goal = jnp.where(renew, start[vertices], goal)
-        goal_joined = jnp.where(renew, is_corner[vertices], goal_joined)
-        worth = value[vertices]
-        vertices = vertices - (2 * at_begin if budget else 0)
-        return (vertices, (in_chain | ends) & ~at_begin, goal, goal_joined), (kind.astype(jnp.int32), worth)
+        here = vertices - (at_corner if budget else 0)
+        line, renew = choice[here], ends | at_corner
+        goal = jnp.where(renew, line // 4, goal)
+        goal_joined = jnp.where(renew, line // 2 % 2 > 0, goal_joined)
+        before = here - (2 * at_begin if budget else 0)
+        return (before, (in_chain | ends) & ~at_begin, goal, goal_joined), (kind.astype(jnp.int32), here)
 
-    index = jnp.arange(choices[0].shape[0], dtype=jnp.int32)
     carry = (vertices, jnp.zeros((), bool), jnp.zeros((), jnp.int32), jnp.zeros((), bool))
-    return jax.lax.scan(step, carry, (index, *choices), reverse=True)[1]
+    index = jnp.arange(choices.shape[0], dtype=jnp.int32)
+    return jax.lax.scan(step, carry, (index, choices), reverse=True)[1]
 
 
 def _turn(start: _Start, point: _Start) -> tuple[Array, Array]:
@@ -271,8 +273,14 @@ def _before(x: Array) -> Array:
 def _least(cost: Float[Array, "W K"]) -> tuple[Int[Array, " W"], Float[Array, " W"]]:
     """Where in each row the least cost stands, and that cost."""
     bits = _in_order(cost)
-    least = jnp.min(bits, 1)
-    return jax.vmap(first_true)(bits == least[:, None]), jax.lax.bitcast_convert_type(least, cost.dtype)
+    least = _minimum(bits)
+    which = jnp.where(bits == least[:, None], jnp.arange(STARTS, dtype=jnp.int32)[None], STARTS)
+    return _minimum(which), jax.lax.bitcast_convert_type(least, cost.dtype)
+
+
+def _minimum(numbers: Int[Array, "*s K"]) -> Int[Array, "*s"]:
+    """The least of each row."""
+    return jnp.min(functools.reduce(jnp.minimum, jnp.split(numbers, STARTS // FOLD, -1)), -1)
 
 
 def _in_order(cost: Float[Array, "*s"]) -> Int[Array, "*s"]:
@@ -281,11 +289,11 @@ def _in_order(cost: Float[Array, "*s"]) -> Int[Array, "*s"]:
 
 
 def _first_fit(points: _Start, weight: Float[Array, " N"]) -> _Fit:
-    """For each point the fit of it alone, seen from the point before: across its beam."""
+    """For each point the fit of it alone, as the point before sees it: a line across its beam."""
     c, s = _turn(jax.tree.map(_before, points), points)
+    u, t = points.inverse * c, points.inverse * s
     zero = jnp.zeros_like(weight)
-    u = points.inverse / jnp.where(c > 0, c, 1)
-    return _Fit(u=u, t=zero, huu=weight * c * c, hut=weight * c * s, htt=weight * s * s, det=zero, rss=zero)
+    return _Fit(u=u, t=t, huu=weight * c * c, hut=weight * c * s, htt=weight * s * s, det=zero, rss=zero)
 
 
 def _observe(
@@ -296,14 +304,12 @@ def _observe(
     inverse: Array,
     weight: Array,
     tangent_weight: Array,
-    has_direction: Array,
 ) -> _Fit:
     """One more point for the fits of all starts."""
     predicted, turned = fit.u * c + fit.t * s, fit.t * c - fit.u * s
-    # A line through one point has no direction yet.
     slant = tangent_weight * range_ * turned
     square = predicted * predicted
-    weight = weight * jnp.where(has_direction & (predicted > 0), square / (square + slant * slant), 1)
+    weight = weight * jnp.where(predicted > 0, square / (square + slant * slant), 1)
     to_u, to_t = fit.htt * c - fit.hut * s, fit.huu * s - fit.hut * c
     det = fit.det + weight * jnp.maximum(to_u * c + to_t * s, 0)
     innovation = inverse - predicted
