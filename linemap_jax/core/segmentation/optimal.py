@@ -16,9 +16,14 @@ from linemap_jax.core.segmentation.incremental import Run, gap_gate
 from linemap_jax.core.segmentation.polyline import BEGIN, CORNER, END, LEFT, Polyline, Sweep, best_polyline, refine
 from linemap_jax.core.sensor import Points
 from linemap_jax.core.settings import SensorNoise, Thresholds
-from linemap_jax.core.slots import all_true
+from linemap_jax.core.slots import all_true, earliest_true, latest_true
 from linemap_jax.core.state import Lines, Pose, pytree
 
+FALSE_CORNERS = 0.1
+"""That noise makes in a scan of one wall, at most. With 1 the price would be that of the Bayesian information
+criterion, which divides walls of a dozen points in one scan of twenty."""
+SLANT_BEAMS = 4
+"""To either side, from which it is told how steep a wall stands to a beam."""
 LEFT_WEIGHT = 2 / 3
 """With a budget, what is least is the root mean square of the residuals plus this times the share of the points that no
 line covers, m. A point then costs 2 `LEFT_WEIGHT` times that root mean square, as a first search gives it, m^2."""
@@ -55,8 +60,9 @@ class Segmented:
 def segment(points: Points, thresholds: Thresholds, noise: SensorNoise, *, max_vertices: int | None) -> Segmented:
     """Divide the points of a scan into the runs that explain them best.
 
-    Without a budget residuals count in sigmas; a vertex costs what the Bayesian information criterion says of its two
-    coordinates, 2 log(number of points); and a point that is left to the circles `line_sigmas`^2.
+    Without a budget residuals count in sigmas. A vertex has two coordinates, and costs 2 log(number of points /
+    `FALSE_CORNERS`), which is what noise gains by them at one of the points with a probability of `FALSE_CORNERS`, at
+    most. A point that is left to the circles costs `line_sigmas`^2.
 
     Args:
       points: the points of the scan.
@@ -77,21 +83,41 @@ def segment(points: Points, thresholds: Thresholds, noise: SensorNoise, *, max_v
 def _by_criterion(points: Points, thresholds: Thresholds, noise: SensorNoise) -> Segmented:
     arc = jnp.minimum(points.range, _before(points.range)) * points.turn
     near, adjacent = _follows(points, gap_gate(arc, thresholds, noise), thresholds.gap_beams)
-    one = jnp.ones_like(points.range)
+    angle, one = _angle(points), jnp.ones_like(points.range)
     sweep = Sweep(
-        angle=_angle(points),
+        angle=angle,
         range=jnp.where(points.valid, points.range, 1),
-        weight=one / noise.range_sigma,
+        weight=1 / _spread(points.range, angle, near & adjacent, noise),
         price=one * thresholds.line_sigmas**2,
         follows=near & adjacent,
         again=jnp.zeros_like(near),
         valid=points.valid,
     )
-    price = 2 * jnp.log(jnp.maximum(jnp.sum(points.valid), 2).astype(one.dtype))
-    ratio = jnp.asarray(noise.bearing_sigma / noise.range_sigma)
-    kind, _, _ = best_polyline(sweep, ratio, price, max_vertices=None, min_points=3)
+    count = jnp.maximum(jnp.sum(points.valid), 2).astype(one.dtype)
+    price = 2 * jnp.log(count / FALSE_CORNERS)
+    kind, _, _ = best_polyline(sweep, price, max_vertices=None, min_points=3)
     nowhere = jnp.zeros((0, 2), one.dtype)
     return _segmented(points, kind, near, adjacent, nowhere, nowhere)
+
+
+def _spread(
+    range_: Float[Array, " N"], angle: Float[Array, " N"], follows: Bool[Array, " N"], noise: SensorNoise
+) -> Float[Array, " N"]:
+    """Standard deviation of ranges along their beams, m: an error of the bearing tells where a wall stands at a slant.
+
+    The slant is that of the points a few beams on either side, as far as each follows the one before.
+    """
+    index = jnp.arange(range_.shape[0], dtype=jnp.int32)
+    first = latest_true(~follows | (index == 0))
+    last = jnp.concatenate([earliest_true(~follows)[1:] - 1, index[-1:]])
+
+    def slope_to(other: Int[Array, " N"]) -> Float[Array, " N"]:
+        turn = angle[other] - angle
+        return jnp.where(turn == 0, 0, jnp.abs((range_[other] - range_) / jnp.where(turn == 0, 1, turn)))
+
+    behind, ahead = jnp.maximum(index - SLANT_BEAMS, first), jnp.minimum(index + SLANT_BEAMS, last)
+    slope = jnp.maximum(slope_to(behind), slope_to(ahead))
+    return jnp.sqrt(noise.range_sigma**2 + (noise.bearing_sigma * slope) ** 2)
 
 
 def _by_budget(points: Points, noise: SensorNoise, max_vertices: int) -> Segmented:
@@ -144,7 +170,7 @@ def _by_budget(points: Points, noise: SensorNoise, max_vertices: int) -> Segment
         zero = jnp.zeros((), dtype)
         # The vertex where a ring is cut open stands at both ends.
         within = max_vertices + opened.astype(jnp.int32)
-        kind, value, cost = best_polyline(sweep, zero, zero, max_vertices=max_vertices + 1, min_points=2, within=within)
+        kind, value, cost = best_polyline(sweep, zero, max_vertices=max_vertices + 1, min_points=2, within=within)
         # A ring is cut open at the corner farthest from its two ends, if there is one.
         off = jnp.where(kind == CORNER, jnp.abs(2 * place - count), 4 * n)
         corner = jnp.min(jnp.where(off == jnp.min(off), place, n - 1))

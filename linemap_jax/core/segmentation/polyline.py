@@ -2,15 +2,19 @@
 
 Seen from the scanner a line is linear in the inverse range, 1/r = u cos(phi) + t sin(phi), so that the residual of a
 range is, to first order, r - r^2 (u cos(phi) + t sin(phi)): the most likely line of a run is a linear least-squares
-fit. A polyline is continuous in 1/r, with vertices on the beams. What it costs is the sum of its squared residuals, a
-price for each vertex (or none, where their number is given), and a price for each point that no line covers; a corner
-that two lines share is one vertex.
+fit. What a polyline costs is the sum of its squared residuals, a price for each vertex (or none, where their number is
+given), and a price for each point that no line covers; a corner that two lines share is one vertex.
 
-`best_polyline` visits the beams in order. For a polyline that has a vertex at a beam, what its past says of the inverse
-range there is one quadratic; that of the cheapest past is kept, for each number of vertices, and the next line starts
-from it. Of lines that share no corner this finds the best ones (optimal partitioning, Jackson et al. 2005). A shared
-corner couples lines, and a past that is not the cheapest may win in the end; Fearnhead, Maidstone and Letchford (2019)
-keep all that can. To keep one is what makes the search quick, and what it costs is tested.
+`best_polyline` visits the beams in order and finds the best lines (optimal partitioning, Jackson et al. 2005). Two
+surrogates of a corner keep it quick:
+
+- Where vertices have a price, lines are free, each the most likely one of its run, and two neighbours share a corner if
+  they cross between the last beam of one and the first of the other.
+- Where their number is given, a polyline is continuous in 1/r, with corners on beams. What its past says of the inverse
+  range at a beam is then one quadratic, and the next line starts from it.
+
+A corner couples lines, and a past that is not the cheapest may win in the end; Fearnhead, Maidstone and Letchford
+(2019) keep all that can. Here the cheapest is kept, for each number of vertices, and what that costs is tested.
 
 `refine` moves the vertices off their beams and takes the residuals as they are: Levenberg-Marquardt.
 
@@ -65,20 +69,18 @@ class _Start(NamedTuple):
     place: Array  # in the sweep
     cos: Array  # of its angle
     sin: Array
+    turn: Array  # tangent of the angle to the next point
     inverse: Array  # 1/r
     variance: Array  # of that, if the line begins there: of one point
 
 
 class _Past(NamedTuple):
-    """What stands before a start, by the number of vertices up to the end of the line that begins there.
+    """What stands before a start, by the number of vertices up to the end of the line that begins there."""
 
-    If that is a corner, the past costs `corner` + (1/r - value)^2 / variance.
-    """
-
-    corner: Array
-    value: Array
-    variance: Array
     begin: Array  # cost, if the line begins a polyline
+    corner: Array  # cost, if it goes on from the line that ends at the start
+    value: Array  # 1/r of that line there
+    extent: Array  # with a budget the variance of `value`; without one the derivative of 1/r by the angle
 
 
 class _Fit(NamedTuple):
@@ -95,7 +97,6 @@ class _Fit(NamedTuple):
 
 def best_polyline(
     sweep: Sweep,
-    tangent_weight: Float[Array, ""],
     vertex_price: Float[Array, ""],
     *,
     max_vertices: int | None,
@@ -106,8 +107,6 @@ def best_polyline(
 
     Args:
       sweep: `N` points; those that are not valid stand last.
-      tangent_weight: bearing sigma / range sigma; a residual's variance grows by the square of this times the range
-        times the tangent of the incidence.
       vertex_price: of each vertex, where there is no budget.
       max_vertices: the budget; None prices the vertices instead.
       min_points: of each line, not counting the corner that it shares with the line before.
@@ -135,8 +134,14 @@ def best_polyline(
 
     inverse = 1 / jnp.where(sweep.valid, sweep.range, 1)
     weight = (sweep.weight * sweep.range**2) ** 2
+    after = jnp.concatenate([sweep.angle[1:], sweep.angle[-1:]])
     points = _Start(
-        place=index, cos=jnp.cos(sweep.angle), sin=jnp.sin(sweep.angle), inverse=inverse, variance=1 / weight
+        place=index,
+        cos=jnp.cos(sweep.angle),
+        sin=jnp.sin(sweep.angle),
+        turn=jnp.tan(after - sweep.angle),
+        inverse=inverse,
+        variance=1 / weight,
     )
     ordinal = index - sweep.again
 
@@ -147,12 +152,12 @@ def best_polyline(
         latest: _Past
         start, past, fit, latest, so_far, free = carry
         point: _Start
-        point, ordinal, before, first, range_, weight, follows, price, valid = x
+        point, ordinal, before, first, weight, follows, price, valid = x
 
         # The point before is one more start; the others see one more point.
         newest = slot == free
         c, s = _turn(start, point)
-        fit = _observe(fit, c, s, range_, point.inverse, weight, tangent_weight)
+        fit = _observe(fit, c, s, point.inverse, weight)
         fit = fit._replace(rss=jnp.where(follows & ((c > 0) | (s > LEAST_SINE)), fit.rss, infinite))
         start, fit = (
             jax.tree.map(lambda new, old: jnp.where(newest, new, old), *pair)
@@ -163,37 +168,49 @@ def best_polyline(
         # What a line from each start to this point costs
         size = ordinal - start.place
 
-        def joined(value: Array, variance: Array, least: int) -> Array:
-            """Shape `[W, K]` or `[1, K]`."""
-            u, det, htt, rss, far = (x[None] for x in (fit.u, fit.det, fit.htt, fit.rss, size >= least))
-            total = variance * det + htt
-            can_be = far & (value * htt + u * variance * det > 0)
-            return rss + jnp.where(can_be, (value - u) ** 2 * det / total, infinite)
+        u, t, det, htt, rss, turn = (x[None] for x in (fit.u, fit.t, fit.det, fit.htt, fit.rss, start.turn))
 
-        corner = past.corner + joined(past.value, past.variance, min_points)
-        begin = past.begin + joined(start.inverse[None], start.variance[None], min_points - 1)
+        def coupled(value: Array, variance: Array) -> tuple[Array, Array]:
+            """What the vertex adds, and whether it is in front of the scanner. Shape `[W, K]` or `[1, K]`."""
+            total = variance * det + htt
+            return (value - u) ** 2 * det / total, value * htt + u * variance * det > 0
+
+        def crossing(value: Array, slope: Array) -> tuple[Array, Array]:
+            """The same of a corner where lines cross."""
+            apart = value - u
+            return jnp.zeros_like(u), (apart * (apart + (slope - t) * turn) <= 0) & (u + t * turn > 0)
+
+        def cost_of(past: Array, vertex: tuple[Array, Array], least: int) -> Array:
+            return past + rss + jnp.where((size >= least)[None] & vertex[1], vertex[0], infinite)
+
+        at_corner = (coupled if budget else crossing)(past.value, past.extent)
+        corner = cost_of(past.corner, at_corner, min_points)
+        begin = cost_of(past.begin, coupled(start.inverse[None], start.variance[None]), min_points - 1)
         each = jnp.minimum(corner, begin)
         which, cost = _least(each)
 
-        # The quadratic that the cheapest past leaves
+        # The line of the cheapest past
         rows = jnp.arange(width)
         at, f = _Start(*(x[which] for x in start)), _Fit(*(x[which] for x in fit))
         is_corner = corner[rows, which] < begin[rows, which]
-        value = jnp.where(is_corner, past.value[rows, which], at.inverse)
-        variance = jnp.where(is_corner, past.variance[rows, which], at.variance)
+        value = jnp.where(is_corner, past.value[rows, which] if budget else f.u, at.inverse)
+        variance = jnp.where(is_corner, past.extent[rows, which], at.variance) if budget else at.variance
         c, s = _turn(at, point)
         total = variance * f.det + f.htt
         total = jnp.where(total > 0, total, 1)
         u = (value * f.htt + f.u * variance * f.det) / total
         t = f.t - f.hut / jnp.where(f.htt > 0, f.htt, 1) * (u - f.u)
         here = u * c + t * s
-        spread = jnp.maximum(f.htt * c * c - 2 * f.hut * c * s + f.huu * s * s, 0)
-        variance = (spread * variance + s * s) / total
-        can_be = (cost < infinite) & (here > 0) & (variance > 0) & valid
+        if budget:
+            spread = jnp.maximum(f.htt * c * c - 2 * f.hut * c * s + f.huu * s * s, 0)
+            extent = (spread * variance + s * s) / total
+        else:
+            extent = t * c - u * s
+        can_be = (cost < infinite) & (here > 0) & valid
         # Nothing is known of a line that cannot be.
-        here, variance = (jnp.where(can_be, y, 1) for y in (here, variance))
+        here, extent = (jnp.where(can_be, y, 1) for y in (here, extent))
         end = jnp.where(can_be, cost, infinite)
-        latest = _Past(corner=later(end, 1), value=moved(here), variance=moved(variance), begin=later(so_far, 2))
+        latest = _Past(begin=later(so_far, 2), corner=later(end, 1), value=moved(here), extent=moved(extent))
 
         left = so_far + jnp.where(valid, price, 0)
         is_end = end < left
@@ -211,7 +228,7 @@ def best_polyline(
     fits = _first_fit(points, weight)
     fits = fits._replace(rss=jnp.where(sweep.follows & (index > 0), fits.rss, infinite))
     carry = (
-        _Start(*[zero] * 5)._replace(place=jnp.zeros(STARTS, jnp.int32)),
+        _Start(*[zero] * 6)._replace(place=jnp.zeros(STARTS, jnp.int32)),
         _Past(*[one] * 4),
         _Fit(*[zero] * 7)._replace(rss=zero + infinite),
         _Past(*[one[:, 0]] * 4),
@@ -219,7 +236,7 @@ def best_polyline(
         jnp.zeros((), jnp.int32),
     )
     before = jax.tree.map(_before, points)
-    xs = (points, ordinal, before, fits, sweep.range, weight, sweep.follows, sweep.price, sweep.valid)
+    xs = (points, ordinal, before, fits, weight, sweep.follows, sweep.price, sweep.valid)
     values: Array
     (*_, so_far, _), (choices, values) = jax.lax.scan(step, carry, xs)
     vertices = jnp.asarray((max_vertices if within is None else within) if budget else 0, jnp.int32)
@@ -296,23 +313,11 @@ def _first_fit(points: _Start, weight: Float[Array, " N"]) -> _Fit:
     return _Fit(u=u, t=t, huu=weight * c * c, hut=weight * c * s, htt=weight * s * s, det=zero, rss=zero)
 
 
-def _observe(
-    fit: _Fit,
-    c: Array,
-    s: Array,
-    range_: Array,
-    inverse: Array,
-    weight: Array,
-    tangent_weight: Array,
-) -> _Fit:
+def _observe(fit: _Fit, c: Array, s: Array, inverse: Array, weight: Array) -> _Fit:
     """One more point for the fits of all starts."""
-    predicted, turned = fit.u * c + fit.t * s, fit.t * c - fit.u * s
-    slant = tangent_weight * range_ * turned
-    square = predicted * predicted
-    weight = weight * jnp.where(predicted > 0, square / (square + slant * slant), 1)
     to_u, to_t = fit.htt * c - fit.hut * s, fit.huu * s - fit.hut * c
     det = fit.det + weight * jnp.maximum(to_u * c + to_t * s, 0)
-    innovation = inverse - predicted
+    innovation = inverse - (fit.u * c + fit.t * s)
     gain = weight * innovation / jnp.where(det > 0, det, 1)
     return _Fit(
         u=fit.u + gain * to_u,
