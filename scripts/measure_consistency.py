@@ -111,7 +111,7 @@ def accuracy(runs: int) -> str:
     return (
         f"Root mean square error of rho, the distance from the scanner, over that of orthogonal regression of the same "
         f"points; the {len(cells)} cells with an exact pose, {runs} runs each. The lines of `optimal`: "
-        f"{np.median(ours):.2f} in the median, {_range(ours)}. Regression with weights, as laser_line_extraction does it: "
+        f"{np.median(ours):.2f} in the median, {_range(ours)}. Regression with weights, as in laser_line_extraction: "
         f"{np.median(weighted):.2f} in the median, {_range(weighted)}."
     )
 

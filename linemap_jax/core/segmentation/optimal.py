@@ -10,13 +10,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from linemap_jax.core.frames import dot, perp
+from linemap_jax.core.frames import dot, perp, unit
 from linemap_jax.core.runs import Runs
-from linemap_jax.core.segmentation.incremental import Run, gap_gate
+from linemap_jax.core.segmentation.incremental import Run, follow, gap_gate
 from linemap_jax.core.segmentation.polyline import BEGIN, CORNER, END, LEFT, Polyline, Sweep, best_polyline, refine
 from linemap_jax.core.sensor import Points
 from linemap_jax.core.settings import SensorNoise, Thresholds
-from linemap_jax.core.slots import all_true, earliest_true, latest_true
+from linemap_jax.core.slots import all_true, choose, earliest_true, latest_true
 from linemap_jax.core.state import Lines, Pose, pytree
 
 FALSE_CORNERS = 0.1
@@ -81,8 +81,7 @@ def segment(points: Points, thresholds: Thresholds, noise: SensorNoise, *, max_v
 
 
 def _by_criterion(points: Points, thresholds: Thresholds, noise: SensorNoise) -> Segmented:
-    arc = jnp.minimum(points.range, _before(points.range)) * points.turn
-    near, adjacent = _follows(points, gap_gate(arc, thresholds, noise), thresholds.gap_beams)
+    near, adjacent = follow(points, lambda arc: gap_gate(arc, thresholds, noise), thresholds.gap_beams)
     angle, one = _angle(points), jnp.ones_like(points.range)
     sweep = Sweep(
         angle=angle,
@@ -131,8 +130,7 @@ def _by_budget(points: Points, noise: SensorNoise, max_vertices: int) -> Segment
     def gate(arc: Array) -> Array:
         return jnp.maximum(BUDGET_GAP_DISTANCE, BUDGET_GAP_SPACINGS * arc)
 
-    arc = jnp.minimum(points.range, _before(points.range)) * points.turn
-    near, adjacent = _follows(points, gate(arc), BUDGET_GAP_BEAMS)
+    near, adjacent = follow(points, gate, BUDGET_GAP_BEAMS)
     follows = near & adjacent
     last = jnp.maximum(ring_count - 1, 0)
     across = points.position[0] - points.position[last]
@@ -299,8 +297,7 @@ def lines_of_polyline(lines: Lines, segmented: Segmented, pose: Pose) -> Lines:
     length = jnp.sqrt(dot(along, along))
     tangent = along / jnp.where(length > 0, length, 1)[:, None]
     angle = jnp.arctan2(-tangent[:, 0], tangent[:, 1])
-    # The normal as `Lines` will have it
-    normal = jnp.stack([jnp.cos(angle), jnp.sin(angle)], -1)
+    normal = unit(angle)  # as `Lines` will have it
     from_anchor = begin - (lines.anchor - pose.mean[None, :2])
     start = dot(perp(normal), from_anchor)
     laid = dataclasses.replace(
@@ -310,9 +307,7 @@ def lines_of_polyline(lines: Lines, segmented: Segmented, pose: Pose) -> Lines:
         first_angle=angle,
         extent=jnp.stack([start, start + length], -1),
     )
-    return jax.tree.map(
-        lambda a, b: jnp.where(lines.valid.reshape(lines.valid.shape + (1,) * (a.ndim - 1)), a, b), laid, lines
-    )
+    return choose(lines.valid, laid, lines)
 
 
 def join_corners(lines: Lines, runs: Runs, segmented: Segmented, pose: Pose) -> Lines:
@@ -344,15 +339,6 @@ def join_corners(lines: Lines, runs: Runs, segmented: Segmented, pose: Pose) -> 
     return dataclasses.replace(lines, extent=jnp.stack([begins, ends], -1))
 
 
-def _follows(
-    points: Points, gap: Float[Array, " N"], beams: Array | float
-) -> tuple[Bool[Array, " N"], Bool[Array, " N"]]:
-    """Criteria 1 and 3: whether each point is near the one before, and whether its bearing is."""
-    step = points.position - _before(points.position)
-    other = points.valid & (jnp.arange(points.valid.shape[0]) > 0)
-    return other & (dot(step, step) < gap**2), other & (points.turn < beams * points.spacing)
-
-
 def _angle(points: Points) -> Float[Array, " N"]:
     """The angle of each beam from the first one, growing."""
 
@@ -361,8 +347,3 @@ def _angle(points: Points) -> Float[Array, " N"]:
 
     turn = jnp.where(points.valid & (jnp.arange(points.valid.shape[0]) > 0), points.turn, 0)
     return jax.lax.scan(add, jnp.zeros((), turn.dtype), turn)[1]
-
-
-def _before(x: Float[Array, "N *s"]) -> Float[Array, "N *s"]:
-    """What stands before each; the first for the first."""
-    return jnp.concatenate([x[:1], x[:-1]])

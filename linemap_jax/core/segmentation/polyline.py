@@ -31,6 +31,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from linemap_jax.core.segmentation.incremental import one_before
 from linemap_jax.core.state import pytree
 
 MOST_ANGLE = 3.0
@@ -235,7 +236,7 @@ def best_polyline(
         jnp.zeros(width, dtype),
         jnp.zeros((), jnp.int32),
     )
-    before = jax.tree.map(_before, points)
+    before = jax.tree.map(one_before, points)
     xs = (points, ordinal, before, fits, weight, sweep.follows, sweep.price, sweep.valid)
     values: Array
     (*_, so_far, _), (choices, values) = jax.lax.scan(step, carry, xs)
@@ -282,11 +283,6 @@ def _turn(start: _Start, point: _Start) -> tuple[Array, Array]:
     return start.cos * point.cos + start.sin * point.sin, start.cos * point.sin - start.sin * point.cos
 
 
-def _before(x: Array) -> Array:
-    """What stands before each; the first for the first."""
-    return jnp.concatenate([x[:1], x[:-1]])
-
-
 def _least(cost: Float[Array, "W K"]) -> tuple[Int[Array, " W"], Float[Array, " W"]]:
     """Where in each row the least cost stands, and that cost."""
     bits = _in_order(cost)
@@ -307,7 +303,7 @@ def _in_order(cost: Float[Array, "*s"]) -> Int[Array, "*s"]:
 
 def _first_fit(points: _Start, weight: Float[Array, " N"]) -> _Fit:
     """For each point the fit of it alone, as the point before sees it: a line across its beam."""
-    c, s = _turn(jax.tree.map(_before, points), points)
+    c, s = _turn(jax.tree.map(one_before, points), points)
     u, t = points.inverse * c, points.inverse * s
     zero = jnp.zeros_like(weight)
     return _Fit(u=u, t=t, huu=weight * c * c, hut=weight * c * s, htt=weight * s * s, det=zero, rss=zero)
