@@ -22,6 +22,8 @@ from linemap_jax.core.state import Lines, Pose, pytree
 FALSE_CORNERS = 0.1
 """That noise makes in a scan of one wall, at most. With 1 the price would be that of the Bayesian information
 criterion, which divides walls of a dozen points in one scan of twenty."""
+LEAST_POINTS = 3
+"""Of a line without a budget, which the paper asks for too."""
 SLANT_BEAMS = 4
 """To either side, from which it is told how steep a wall stands to a beam."""
 LEFT_WEIGHT = 2 / 3
@@ -82,21 +84,35 @@ def segment(points: Points, thresholds: Thresholds, noise: SensorNoise, *, max_v
 
 def _by_criterion(points: Points, thresholds: Thresholds, noise: SensorNoise) -> Segmented:
     near, adjacent = follow(points, lambda arc: gap_gate(arc, thresholds, noise), thresholds.gap_beams)
+    sweep, price = priced(points, near & adjacent, thresholds, noise)
+    kind, _, _ = best_polyline(sweep, price, max_vertices=None, min_points=LEAST_POINTS)
+    nowhere = jnp.zeros((0, 2), points.range.dtype)
+    return _segmented(points, kind, near, adjacent, nowhere, nowhere)
+
+
+def priced(
+    points: Points, follows: Bool[Array, " N"], thresholds: Thresholds, noise: SensorNoise
+) -> tuple[Sweep, Float[Array, ""]]:
+    """What is searched without a budget, and the price of a vertex.
+
+    Args:
+      points: the points of the scan.
+      follows: whether a line may hold a point and the one before.
+      thresholds: `line_sigmas`.
+      noise: of the sensor.
+    """
     angle, one = _angle(points), jnp.ones_like(points.range)
     sweep = Sweep(
         angle=angle,
         range=jnp.where(points.valid, points.range, 1),
-        weight=1 / _spread(points.range, angle, near & adjacent, noise),
+        weight=1 / _spread(points.range, angle, follows, noise),
         price=one * thresholds.line_sigmas**2,
-        follows=near & adjacent,
-        again=jnp.zeros_like(near),
+        follows=follows,
+        again=jnp.zeros_like(follows),
         valid=points.valid,
     )
     count = jnp.maximum(jnp.sum(points.valid), 2).astype(one.dtype)
-    price = 2 * jnp.log(count / FALSE_CORNERS)
-    kind, _, _ = best_polyline(sweep, price, max_vertices=None, min_points=3)
-    nowhere = jnp.zeros((0, 2), one.dtype)
-    return _segmented(points, kind, near, adjacent, nowhere, nowhere)
+    return sweep, 2 * jnp.log(count / FALSE_CORNERS)
 
 
 def _spread(
@@ -127,14 +143,11 @@ def _by_budget(points: Points, noise: SensorNoise, max_vertices: int) -> Segment
     missing = 2 * jnp.pi - jnp.sum(jnp.where(points.valid, points.turn, 0))
     ring_count = jnp.where(jnp.abs(missing) < points.spacing / 2, count - 1, count)
 
-    def gate(arc: Array) -> Array:
-        return jnp.maximum(BUDGET_GAP_DISTANCE, BUDGET_GAP_SPACINGS * arc)
-
-    near, adjacent = follow(points, gate, BUDGET_GAP_BEAMS)
+    near, adjacent = follow(points, budget_gap, BUDGET_GAP_BEAMS)
     follows = near & adjacent
     last = jnp.maximum(ring_count - 1, 0)
     across = points.position[0] - points.position[last]
-    closed = dot(across, across) < gate(jnp.minimum(points.range[0], points.range[last]) * points.spacing) ** 2
+    closed = dot(across, across) < budget_gap(jnp.minimum(points.range[0], points.range[last]) * points.spacing) ** 2
     closed &= (jnp.abs(missing) < BUDGET_GAP_BEAMS * points.spacing) & (count > LEAST_RING)
     closed &= jnp.all(follows | ~points.valid | (jnp.arange(n) == 0))
 
@@ -216,6 +229,11 @@ def _by_budget(points: Points, noise: SensorNoise, max_vertices: int) -> Segment
         jac_measurement=points.jac_measurement[rolled],
     )
     return _segmented(moved, kind[:n], near | opened, adjacent | opened, corner[begins], corner[begins + 1])
+
+
+def budget_gap(arc: Float[Array, "*s"]) -> Float[Array, "*s"]:
+    """With a budget, the largest distance between successive points, m, by the arc between their beams."""
+    return jnp.maximum(BUDGET_GAP_DISTANCE, BUDGET_GAP_SPACINGS * arc)
 
 
 def _vertices(sweep: Sweep, kind: Int[Array, " N"], inverse: Float[Array, " N"], size: int) -> Polyline:
