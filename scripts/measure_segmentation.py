@@ -8,9 +8,9 @@ noise is scored as those were, by what the beams would meet: the root mean squar
 returns that meet a line, the share of beams without a return that meet none, and of simulated scans the area between
 the true polygon and that of the vertices, relative to the true one. Circles are not scored. Means over scans.
 
-Two more tables: how long a scan takes, in float32, alone and with others side by side, on as many cores as the process
-may use (taskset -c 0 for one); and by how much what was found is dearer than a lower bound, the best independent lines
-with one vertex each, as if every two neighbours shared one: an upper bound on what a better search might gain.
+Two more tables: how much time of a core a scan takes, in float32, alone and with others side by side; and by how much
+what was found is dearer than a lower bound, the best independent lines with one vertex each, as if every two neighbours
+shared one: more than any search can gain.
 
 The scans are looked for in $LINEMAP_DATA (default ../shared/data), the scores in $LINEMAP_TOOLS (../shared/tools);
 where either is absent there is nothing to measure.
@@ -208,7 +208,7 @@ def gap_of_priced(data: Any, kind: str, every: int) -> np.ndarray:
 
 
 def seconds(data: Any, kind: str, budget: int | None, side_by_side: int | None) -> list[float]:
-    """How long scans of 360 or 361 beams take in float32: quartiles of the mean over scans, of several rounds.
+    """What scans of 360 or 361 beams take of a core, in float32: quartiles of the mean over scans, of several rounds.
 
     Args:
       data: the benchmark.
@@ -232,10 +232,10 @@ def seconds(data: Any, kind: str, budget: int | None, side_by_side: int | None) 
     count = len(given) if side_by_side is None else int(wide.sum())
     rounds = []
     for _ in range(ROUNDS + 1):
-        started = time.perf_counter()
+        started = time.process_time()
         for x in given:
             jax.block_until_ready(run(x))
-        rounds.append((time.perf_counter() - started) / count)
+        rounds.append((time.process_time() - started) / count)
     return np.quantile(rounds[1:], (0.25, 0.5, 0.75)).tolist()
 
 
@@ -244,7 +244,7 @@ Means = dict[str, dict[str, dict[str, list[float]]]]
 
 
 def means(scores: Any, data: Any, every: int) -> tuple[Means, dict[str, list[float]]]:
-    """All methods at all budgets, by kind of scan and metric; and the gaps of all budgets: means and medians over scans."""
+    """All methods at all budgets, by kind of scan and metric: means over scans. And the gaps: medians."""
     budgets, names = data["published_vertex_budgets"].tolist(), data["published_algorithms"].tolist()
     result: Means = {}
     gaps: dict[str, list[float]] = {}
