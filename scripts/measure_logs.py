@@ -10,7 +10,7 @@ import os
 import sys
 import time
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import numpy as np
@@ -25,7 +25,12 @@ DATA = Path(os.environ.get("LINEMAP_DATA", ROOT / "../shared/data"))
 LOGS = {"intel": "Intel", "aces": "ACES", "fhw": "FHW", "freiburg-079": "FR079"}
 COV_POSE = np.diag([0.05, 0.05, 0.01]) ** 2
 CHUNK = 64
-PRESETS: tuple[Literal["default", "paper"], ...] = ("default", "paper")
+WAYS: dict[str, dict[str, Any]] = {
+    "default": preset("default"),
+    "default, `optimal`": preset("default") | {"segmentation": "optimal"},
+    "paper": preset("paper"),
+}
+"""Presets, and one with the other segmentation."""
 BEGIN, END = "<!-- measured:begin -->", "<!-- measured:end -->"
 
 
@@ -38,8 +43,8 @@ def main() -> int:
             print(f"{path} is not there: left out", file=sys.stderr)
             continue
         (chunk,) = chunks_of_readings(open_log(path), 10**6, cov_pose=COV_POSE)
-        for choice in PRESETS:
-            rows.append(f"| {title} | {choice} | " + " | ".join(measure((chunk.scans, chunk.poses), choice)) + " |")
+        for way, options in WAYS.items():
+            rows.append(f"| {title} | {way} | " + " | ".join(measure((chunk.scans, chunk.poses), options)) + " |")
             print(rows[-1], flush=True)
     columns = ("log", "preset", "scans", "lines", "circles", "explained", "held out", "median line", "seen 3 times")
     columns += ("duplicates", "time a scan")
@@ -52,9 +57,9 @@ def main() -> int:
     return 0
 
 
-def measure(log: tuple[Any, Any], choice: Literal["default", "paper"]) -> list[str]:
-    """The figures of one log and preset, from the third column on."""
-    options = preset(choice) | {"jacobians": "analytic", "map_capacity": Capacity(512, 256), "chunk": CHUNK}
+def measure(log: tuple[Any, Any], way: dict[str, Any]) -> list[str]:
+    """The figures of one log, mapped in some way, from the third column on."""
+    options = way | {"jacobians": "analytic", "map_capacity": Capacity(512, 256), "chunk": CHUNK}
     build(*log, **options)  # compiles, at each size that the map grows to
     started = time.perf_counter()
     line_map, _ = build(*log, **options)

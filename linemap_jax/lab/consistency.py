@@ -4,10 +4,11 @@ The NEES (normalised estimation error squared) e^T C^-1 e of an estimate of n nu
 chi-square with n degrees of freedom: its mean is n, and 95 % of it lies below the 95 % quantile. The NIS is the same of
 an innovation. One line is taken from each run, since the lines of one scan share its pose.
 
-Three experiments, each a function of a key that makes one run; map them over keys:
+Four experiments, each a function of a key that makes one run; map them over keys:
 
 - `known_points`: the fit alone. The points of a wall are known; nothing is selected.
 - `pipeline`: what `extract` makes of a scan.
+- `rho_errors`: how accurate its lines are, beside other fits of the same points.
 - `fused`: a line of the map after many scans, association known, with pose errors that may persist.
 """
 
@@ -163,6 +164,58 @@ def pipeline(
     length = jnp.asarray(jnp.where(lines.valid & (of_line == which), lines.length, 0))
     longest = jnp.argmax(length)
     return jax.tree.map(lambda x: x[longest], every)._replace(counts=length[longest] > 0), every
+
+
+def rho_errors(
+    key: Array, world: World, pose: Float[Array, "3"], scanner: Scanner, **options: Any
+) -> tuple[Float[Array, "3"], Bool[Array, ""]]:
+    """Errors of the distance to a wall, by the longest line that `extract` finds of it and by other fits of its points.
+
+    Args:
+      key: of the noise and of the choice of the wall.
+      world: walls.
+      pose: of the robot, known.
+      scanner: its noise is what the fits believe.
+      **options: of `extract`.
+
+    Returns:
+      Errors of rho, m: of the line; of orthogonal regression; and of orthogonal regression with each point weighted by
+      its noise across the line (Pfister, Roumeliotis, Burdick: *Weighted line fitting algorithms for mobile robot map
+      building*, ICRA 2003), which is what laser_line_extraction does. And whether there was such a line.
+    """
+    of_wall, of_scan = jax.random.split(key)
+    which, _ = _visible_wall(of_wall, world, pose, scanner)
+    scan, truth = simulate_scan(of_scan, world, pose, scanner)
+    here = Pose(mean=jnp.zeros(3, pose.dtype), cov=jnp.zeros((3, 3), pose.dtype))
+    found = extract(scan, here, noise=noise_of(scanner), **options)
+    lines = found.lines
+    on_wall = jnp.zeros(lines.valid.shape[0] + 1).at[found.line_of_beam].add(truth.thing == which)[:-1]
+    line = jnp.argmax(jnp.where(lines.valid, on_wall, -1))
+    of_line = found.line_of_beam == line
+    beam = unit(scan.bearings)
+    point = jnp.where(of_line, scan.ranges, 0)[:, None] * beam
+
+    def regressed(weight: Array) -> tuple[Array, Array]:
+        """Normal and rho of the line with the least weighted squares of distances."""
+        weight = jnp.where(of_line, weight, 0) / jnp.sum(jnp.where(of_line, weight, 0))
+        centre = weight @ point
+        off = point - centre[None]
+        (xx, xy), (_, yy) = off.T @ (weight[:, None] * off)
+        normal = unit(jnp.arctan2(-2 * xy, yy - xx) / 2)
+        return normal, dot(normal, centre)
+
+    def reweighted(_: Any, line: tuple[Array, Array]) -> tuple[Array, Array]:
+        along = jnp.square(beam @ line[0])
+        across = jnp.square(scanner.bearing_sigma * scan.ranges) * (1 - along)
+        return regressed(1 / (jnp.square(scanner.range_sigma) * along + across))
+
+    plain = regressed(jnp.ones_like(scan.ranges))
+    weighted = jax.lax.fori_loop(0, 5, reweighted, plain)
+    of_extract = dot(lines.normal[line], lines.anchor[line]) + lines.offset[line]
+    wall = jax.tree.map(lambda x: x[which], walls_of(world))
+    rho = jnp.abs(dot(unit(wall.angle), wall.point - pose[:2]))
+    errors = jnp.stack([jnp.abs(x) - rho for x in (of_extract, plain[1], weighted[1])])
+    return errors, on_wall[line] >= MIN_POINTS
 
 
 class Model(NamedTuple):

@@ -63,6 +63,24 @@ def test_one_scan_holds_and_the_print_does_not(name):
         assert printed.inside < 0.8
 
 
+def test_a_line_is_as_accurate_as_other_fits_of_its_points():
+    cell = CELLS["wall of 8 m at 5 m, 30 degrees; 0.03 m, 0.0 degree; exact pose"]
+    where = (cell.world, cell.path[0], cell.scanner)
+
+    @jax.jit
+    def many(keys: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return jax.lax.map(lambda key: consistency.rho_errors(key, *where, jacobians="analytic"), keys, batch_size=100)
+
+    errors, counts = jax.tree.map(np.asarray, many(jax.random.split(jax.random.key(3), RUNS)))
+    assert np.all(counts)
+    spread = errors.std(0)
+    assert np.all(np.abs(errors.mean(0)) < 6 * spread / np.sqrt(RUNS) + 1e-3)
+    # 150 points of 3 cm, and three fits that weigh them differently
+    assert np.all(spread < 3 * 0.03 / np.sqrt(150))
+    assert spread[0] < 1.02 * spread[2] < 1.04 * spread[1]
+    assert len(np.unique(spread)) == 3
+
+
 @pytest.mark.parametrize("correlation", [0.0, 0.9, 1.0])
 def test_fifty_scans_hold_if_the_model_of_the_pose_error_does(correlation):
     cell = CELLS["wall of 2 m at 10 m, 60 degrees; 0.01 m, 0.1 degree; pose 1 cm, 0.2 degree"]

@@ -6,15 +6,16 @@ they lose everything in float32.
 """
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from linemap_jax.core.frames import dot
 from linemap_jax.core.sensor import Points
-from linemap_jax.core.settings import Rules, SensorNoise, Thresholds
+from linemap_jax.core.settings import Number, Rules, SensorNoise, Thresholds
 
 
 class Run(NamedTuple):
@@ -60,14 +61,10 @@ def segment(
       the sums are those of the whole run, each field of shape `[N]`; and how many points broke a run by criteria 1, 2
       and 3.
     """
-    before = jnp.concatenate([points.position[:1], points.position[:-1]])
-    range_before = jnp.concatenate([points.range[:1], points.range[:-1]])
-    step = points.position - before
-    arc = jnp.minimum(points.range, range_before) * points.turn
-    near = dot(step, step) < gap_gate(arc, thresholds, noise) ** 2
-    adjacent = points.turn < thresholds.gap_beams * points.spacing
+    before = one_before(points.position)
+    near, adjacent = follow(points, lambda arc: gap_gate(arc, thresholds, noise), thresholds.gap_beams)
+    follows = near & adjacent
     other = jnp.arange(points.valid.shape[0]) > 0
-    follows = near & adjacent & other & points.valid
 
     steps = _Step(
         x=points.position[:, 0],
@@ -103,6 +100,27 @@ def segment(
     counts = [breaks & ~near, by_distance, breaks & near & ~adjacent]
     counts = jnp.stack([jnp.sum(count, dtype=jnp.int32) for count in counts])
     return ends, run, counts
+
+
+def follow(
+    points: Points, gap: Callable[[Float[Array, " N"]], Float[Array, " N"]], beams: Number
+) -> tuple[Bool[Array, " N"], Bool[Array, " N"]]:
+    """Criteria 1 and 3: whether each point is near the one before, and whether its bearing is. The first has none.
+
+    Args:
+      points: the points of the scan.
+      gap: the largest distance between them, m, by the arc between their beams, m.
+      beams: the largest angle between them, in beam spacings.
+    """
+    step = points.position - one_before(points.position)
+    arc = jnp.minimum(points.range, one_before(points.range)) * points.turn
+    other = points.valid & (jnp.arange(points.valid.shape[0]) > 0)
+    return other & (dot(step, step) < gap(arc) ** 2), other & (points.turn < beams * points.spacing)
+
+
+def one_before(x: Shaped[Array, "N *s"]) -> Shaped[Array, "N *s"]:
+    """What stands before each; the first for the first."""
+    return jnp.concatenate([x[:1], x[:-1]])
 
 
 def gap_gate(arc: Float[Array, "*s"], thresholds: Thresholds, noise: SensorNoise) -> Float[Array, "*s"]:

@@ -10,15 +10,22 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from linemap_jax.core.frames import dot, perp
+from linemap_jax.core.frames import dot, perp, unit
 from linemap_jax.core.runs import Runs
-from linemap_jax.core.segmentation.incremental import Run, gap_gate
+from linemap_jax.core.segmentation.incremental import Run, follow, gap_gate
 from linemap_jax.core.segmentation.polyline import BEGIN, CORNER, END, LEFT, Polyline, Sweep, best_polyline, refine
 from linemap_jax.core.sensor import Points
 from linemap_jax.core.settings import SensorNoise, Thresholds
-from linemap_jax.core.slots import all_true
+from linemap_jax.core.slots import all_true, choose, earliest_true, latest_true
 from linemap_jax.core.state import Lines, Pose, pytree
 
+FALSE_CORNERS = 0.1
+"""That noise makes in a scan of one wall, at most. With 1 the price would be that of the Bayesian information
+criterion, which divides walls of a dozen points in one scan of twenty."""
+LEAST_POINTS = 3
+"""Of a line without a budget, which the paper asks for too."""
+SLANT_BEAMS = 4
+"""To either side, from which it is told how steep a wall stands to a beam."""
 LEFT_WEIGHT = 2 / 3
 """With a budget, what is least is the root mean square of the residuals plus this times the share of the points that no
 line covers, m. A point then costs 2 `LEFT_WEIGHT` times that root mean square, as a first search gives it, m^2."""
@@ -55,8 +62,9 @@ class Segmented:
 def segment(points: Points, thresholds: Thresholds, noise: SensorNoise, *, max_vertices: int | None) -> Segmented:
     """Divide the points of a scan into the runs that explain them best.
 
-    Without a budget residuals count in sigmas; a vertex costs what the Bayesian information criterion says of its two
-    coordinates, 2 log(number of points); and a point that is left to the circles `line_sigmas`^2.
+    Without a budget residuals count in sigmas. A vertex has two coordinates, and costs 2 log(number of points /
+    `FALSE_CORNERS`), which is what noise gains by them at one of the points with a probability of `FALSE_CORNERS`, at
+    most. A point that is left to the circles costs `line_sigmas`^2.
 
     Args:
       points: the points of the scan.
@@ -75,23 +83,56 @@ def segment(points: Points, thresholds: Thresholds, noise: SensorNoise, *, max_v
 
 
 def _by_criterion(points: Points, thresholds: Thresholds, noise: SensorNoise) -> Segmented:
-    arc = jnp.minimum(points.range, _before(points.range)) * points.turn
-    near, adjacent = _follows(points, gap_gate(arc, thresholds, noise), thresholds.gap_beams)
-    one = jnp.ones_like(points.range)
+    near, adjacent = follow(points, lambda arc: gap_gate(arc, thresholds, noise), thresholds.gap_beams)
+    sweep, price = priced(points, near & adjacent, thresholds, noise)
+    kind, _, _ = best_polyline(sweep, price, max_vertices=None, min_points=LEAST_POINTS)
+    nowhere = jnp.zeros((0, 2), points.range.dtype)
+    return _segmented(points, kind, near, adjacent, nowhere, nowhere)
+
+
+def priced(
+    points: Points, follows: Bool[Array, " N"], thresholds: Thresholds, noise: SensorNoise
+) -> tuple[Sweep, Float[Array, ""]]:
+    """What is searched without a budget, and the price of a vertex.
+
+    Args:
+      points: the points of the scan.
+      follows: whether a line may hold a point and the one before.
+      thresholds: `line_sigmas`.
+      noise: of the sensor.
+    """
+    angle, one = _angle(points), jnp.ones_like(points.range)
     sweep = Sweep(
-        angle=_angle(points),
+        angle=angle,
         range=jnp.where(points.valid, points.range, 1),
-        weight=one / noise.range_sigma,
+        weight=1 / _spread(points.range, angle, follows, noise),
         price=one * thresholds.line_sigmas**2,
-        follows=near & adjacent,
-        counts=one,
+        follows=follows,
+        again=jnp.zeros_like(follows),
         valid=points.valid,
     )
-    price = 2 * jnp.log(jnp.maximum(jnp.sum(points.valid), 2).astype(one.dtype))
-    ratio = jnp.asarray(noise.bearing_sigma / noise.range_sigma)
-    kind, _, _ = best_polyline(sweep, ratio, price, max_vertices=None, min_points=3)
-    nowhere = jnp.zeros((0, 2), one.dtype)
-    return _segmented(points, kind, near, adjacent, nowhere, nowhere)
+    count = jnp.maximum(jnp.sum(points.valid), 2).astype(one.dtype)
+    return sweep, 2 * jnp.log(count / FALSE_CORNERS)
+
+
+def _spread(
+    range_: Float[Array, " N"], angle: Float[Array, " N"], follows: Bool[Array, " N"], noise: SensorNoise
+) -> Float[Array, " N"]:
+    """Standard deviation of ranges along their beams, m: an error of the bearing tells where a wall stands at a slant.
+
+    The slant is that of the points a few beams on either side, as far as each follows the one before.
+    """
+    index = jnp.arange(range_.shape[0], dtype=jnp.int32)
+    first = latest_true(~follows | (index == 0))
+    last = jnp.concatenate([earliest_true(~follows)[1:] - 1, index[-1:]])
+
+    def slope_to(other: Int[Array, " N"]) -> Float[Array, " N"]:
+        turn = angle[other] - angle
+        return jnp.where(turn == 0, 0, jnp.abs((range_[other] - range_) / jnp.where(turn == 0, 1, turn)))
+
+    behind, ahead = jnp.maximum(index - SLANT_BEAMS, first), jnp.minimum(index + SLANT_BEAMS, last)
+    slope = jnp.maximum(slope_to(behind), slope_to(ahead))
+    return jnp.sqrt(noise.range_sigma**2 + (noise.bearing_sigma * slope) ** 2)
 
 
 def _by_budget(points: Points, noise: SensorNoise, max_vertices: int) -> Segmented:
@@ -102,15 +143,11 @@ def _by_budget(points: Points, noise: SensorNoise, max_vertices: int) -> Segment
     missing = 2 * jnp.pi - jnp.sum(jnp.where(points.valid, points.turn, 0))
     ring_count = jnp.where(jnp.abs(missing) < points.spacing / 2, count - 1, count)
 
-    def gate(arc: Array) -> Array:
-        return jnp.maximum(BUDGET_GAP_DISTANCE, BUDGET_GAP_SPACINGS * arc)
-
-    arc = jnp.minimum(points.range, _before(points.range)) * points.turn
-    near, adjacent = _follows(points, gate(arc), BUDGET_GAP_BEAMS)
+    near, adjacent = follow(points, budget_gap, BUDGET_GAP_BEAMS)
     follows = near & adjacent
     last = jnp.maximum(ring_count - 1, 0)
     across = points.position[0] - points.position[last]
-    closed = dot(across, across) < gate(jnp.minimum(points.range[0], points.range[last]) * points.spacing) ** 2
+    closed = dot(across, across) < budget_gap(jnp.minimum(points.range[0], points.range[last]) * points.spacing) ** 2
     closed &= (jnp.abs(missing) < BUDGET_GAP_BEAMS * points.spacing) & (count > LEAST_RING)
     closed &= jnp.all(follows | ~points.valid | (jnp.arange(n) == 0))
 
@@ -134,7 +171,7 @@ def _by_budget(points: Points, noise: SensorNoise, max_vertices: int) -> Segment
             weight=jnp.where(pinned, PINNED, 1).astype(dtype),
             price=jnp.broadcast_to(price, place.shape),
             follows=jnp.where(opened, place > 0, follows[straight]),
-            counts=jnp.where(again, 0, 1).astype(dtype),
+            again=again,
             valid=valid,
         )
 
@@ -144,7 +181,7 @@ def _by_budget(points: Points, noise: SensorNoise, max_vertices: int) -> Segment
         zero = jnp.zeros((), dtype)
         # The vertex where a ring is cut open stands at both ends.
         within = max_vertices + opened.astype(jnp.int32)
-        kind, value, cost = best_polyline(sweep, zero, zero, max_vertices=max_vertices + 1, min_points=2, within=within)
+        kind, value, cost = best_polyline(sweep, zero, max_vertices=max_vertices + 1, min_points=2, within=within)
         # A ring is cut open at the corner farthest from its two ends, if there is one.
         off = jnp.where(kind == CORNER, jnp.abs(2 * place - count), 4 * n)
         corner = jnp.min(jnp.where(off == jnp.min(off), place, n - 1))
@@ -192,6 +229,11 @@ def _by_budget(points: Points, noise: SensorNoise, max_vertices: int) -> Segment
         jac_measurement=points.jac_measurement[rolled],
     )
     return _segmented(moved, kind[:n], near | opened, adjacent | opened, corner[begins], corner[begins + 1])
+
+
+def budget_gap(arc: Float[Array, "*s"]) -> Float[Array, "*s"]:
+    """With a budget, the largest distance between successive points, m, by the arc between their beams."""
+    return jnp.maximum(BUDGET_GAP_DISTANCE, BUDGET_GAP_SPACINGS * arc)
 
 
 def _vertices(sweep: Sweep, kind: Int[Array, " N"], inverse: Float[Array, " N"], size: int) -> Polyline:
@@ -273,8 +315,7 @@ def lines_of_polyline(lines: Lines, segmented: Segmented, pose: Pose) -> Lines:
     length = jnp.sqrt(dot(along, along))
     tangent = along / jnp.where(length > 0, length, 1)[:, None]
     angle = jnp.arctan2(-tangent[:, 0], tangent[:, 1])
-    # The normal as `Lines` will have it
-    normal = jnp.stack([jnp.cos(angle), jnp.sin(angle)], -1)
+    normal = unit(angle)  # as `Lines` will have it
     from_anchor = begin - (lines.anchor - pose.mean[None, :2])
     start = dot(perp(normal), from_anchor)
     laid = dataclasses.replace(
@@ -284,9 +325,7 @@ def lines_of_polyline(lines: Lines, segmented: Segmented, pose: Pose) -> Lines:
         first_angle=angle,
         extent=jnp.stack([start, start + length], -1),
     )
-    return jax.tree.map(
-        lambda a, b: jnp.where(lines.valid.reshape(lines.valid.shape + (1,) * (a.ndim - 1)), a, b), laid, lines
-    )
+    return choose(lines.valid, laid, lines)
 
 
 def join_corners(lines: Lines, runs: Runs, segmented: Segmented, pose: Pose) -> Lines:
@@ -318,15 +357,6 @@ def join_corners(lines: Lines, runs: Runs, segmented: Segmented, pose: Pose) -> 
     return dataclasses.replace(lines, extent=jnp.stack([begins, ends], -1))
 
 
-def _follows(
-    points: Points, gap: Float[Array, " N"], beams: Array | float
-) -> tuple[Bool[Array, " N"], Bool[Array, " N"]]:
-    """Criteria 1 and 3: whether each point is near the one before, and whether its bearing is."""
-    step = points.position - _before(points.position)
-    other = points.valid & (jnp.arange(points.valid.shape[0]) > 0)
-    return other & (dot(step, step) < gap**2), other & (points.turn < beams * points.spacing)
-
-
 def _angle(points: Points) -> Float[Array, " N"]:
     """The angle of each beam from the first one, growing."""
 
@@ -335,8 +365,3 @@ def _angle(points: Points) -> Float[Array, " N"]:
 
     turn = jnp.where(points.valid & (jnp.arange(points.valid.shape[0]) > 0), points.turn, 0)
     return jax.lax.scan(add, jnp.zeros((), turn.dtype), turn)[1]
-
-
-def _before(x: Float[Array, "N *s"]) -> Float[Array, "N *s"]:
-    """What stands before each; the first for the first."""
-    return jnp.concatenate([x[:1], x[:-1]])
