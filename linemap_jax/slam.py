@@ -60,7 +60,6 @@ _LEAST_INFORMATION = np.diag([1.0, 1.0, 10.0])  # of a closure, beside its point
 class _Keyframes:
     """What is kept of the keyframes."""
 
-    tracked: list[np.ndarray] = dataclasses.field(default_factory=list)  # [3] pose by tracking
     step: list[np.ndarray] = dataclasses.field(default_factory=list)  # [3] from the one before
     cov_step: list[np.ndarray] = dataclasses.field(default_factory=list)
     middle: list[np.ndarray] = dataclasses.field(default_factory=list)  # [2] of what it sees, in its own frame
@@ -88,6 +87,7 @@ class Slam:
         self._loops = loops
         self._close = partial(_jit_close, settings=loops, registration=registration)
         self._state: Track | None = None
+        self._first = np.zeros(3)  # pose of odometry
         self._keyframes = _Keyframes()
         self._poses = np.zeros((0, 3))  # of the keyframes, by the graph
         self._closures: list[tuple[int, int, np.ndarray, np.ndarray]] = []
@@ -104,7 +104,11 @@ class Slam:
           scans: at most `CHUNK`, stacked.
           odometry: poses of the scanner by the robot's odometry. m, m, rad. Shape `[T, 3]`.
         """
-        count, poses = scans.ranges.shape[0], jnp.asarray(odometry, scans.ranges.dtype)
+        count, counted = scans.ranges.shape[0], np.asarray(odometry, float)
+        if self._state is None:
+            self._first = counted[0]
+        # From where it began, so that float32 resolves its steps in a frame of any country.
+        poses = jnp.asarray(counted - [*self._first[:2], 0], scans.ranges.dtype)
         if self._state is None:
             self._state = begin_track(poses[0], jax.tree.map(lambda x: x[0], scans))
         self._state, said = self._track(
@@ -127,13 +131,12 @@ class Slam:
         for i in range(len(middles)):
             if said.is_keyframe[i]:
                 first = not kept.step
-                kept.tracked.append(np.asarray(said.pose[i], float))
                 kept.step.append(np.zeros(3) if first else np.asarray(said.step[i], float))
                 kept.cov_step.append(covs[i])
                 kept.middle.append(middles[i])
                 kept.surface.append(jax.tree.map(lambda x, i=i: x[i], said.surface))
                 kept.scan.append(jax.tree.map(lambda x, i=i: x[i], scans))
-                pose = kept.tracked[-1] if first else compose(self._poses[-1], kept.step[-1])
+                pose = self._first if first else compose(self._poses[-1], kept.step[-1])
                 self._poses = np.concatenate([self._poses, pose[None]])
             else:
                 seen[i] = said.step[i]
@@ -229,8 +232,9 @@ class Slam:
         count, dtype = len(self._poses), line_map.lines.offset.dtype
         cov = np.diag(np.square(SIGMA_NEXT))
         numbers, pieces = np.arange(count), []
+        width = max(scan.ranges.size for scan in self._keyframes.scan)
         for i in range(0, count, CHUNK):
-            scans = jax.tree.map(lambda *x: np.stack(x), *self._keyframes.scan[i : i + CHUNK])
+            scans = _stacked(self._keyframes.scan[i : i + CHUNK], width)
             size = len(scans.ranges)
             poses = Pose(
                 mean=jnp.asarray(self._poses[i : i + CHUNK], dtype),
@@ -368,6 +372,15 @@ def _cov_of_registration(information: Any, share: Any, prior: np.ndarray) -> np.
     """In float64, on NumPy arrays."""
     with jax.enable_x64(True):
         return np.asarray(_jit_cov(*(np.asarray(x, float) for x in (information, share, prior))))
+
+
+def _stacked(scans: list[Scan], width: int) -> Scan:
+    """Scans of at most `width` beams, filled up with beams that did not return."""
+
+    def fill(*x: np.ndarray) -> np.ndarray:
+        return np.stack([np.pad(each, (0, width - each.size)) if each.ndim else each for each in x])
+
+    return jax.tree.map(fill, *scans)
 
 
 def _flat(count: int, stacked: Array) -> np.ndarray:

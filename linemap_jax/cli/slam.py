@@ -82,7 +82,7 @@ class Slam(LogOptions):
         plot_map(files[1], line_map, trajectory[:, :2], title=self.log.name, overwrite=self.overwrite)
         poses = trajectory if self.trajectory_frame == "laser" else _of_base(trajectory, mount)
         write_tum(files[2], stamps, poses, overwrite=self.overwrite)
-        covs, doubtful = slammed.cov_trajectory(cov_keyframes), np.concatenate(slammed.shares) < DOUBTFUL
+        covs, doubtful = slammed.cov_trajectory(cov_keyframes), np.concatenate(slammed.shares)[: len(stamps)] < DOUBTFUL
         write_covariances(files[3], stamps, poses, covs, doubtful, overwrite=self.overwrite)
         if interrupted:
             print(f"linemap: interrupted; map and trajectory so far are in {self.output}", file=sys.stderr)
@@ -107,13 +107,13 @@ def _tracked(command: Slam, log: "Log", mount: "Mount") -> tuple["Slammed", "np.
                 raise UsageError(
                     f"{log.path}: has scans without odometry; --standstill does without, --poses takes it from a file"
                 )
-            slammed.add(chunk.scans, slam.compose(odometry, on_robot))
             stamps.append(chunk.timestamps)
+            slammed.add(chunk.scans, slam.compose(odometry, on_robot))
     except KeyboardInterrupt:
-        if not stamps:
+        if len(slammed.keyframes) == 0:
             raise
         interrupted = True
-    return slammed, np.concatenate(stamps), interrupted
+    return slammed, np.concatenate(stamps)[: len(slammed.trajectory())], interrupted
 
 
 def _at_poses(

@@ -9,8 +9,9 @@ from linemap_jax.core.frames import dot, perp, unit
 from linemap_jax.core.propagation import safe_sqrt
 from linemap_jax.core.state import Scan, pytree
 
-POINTS = 180
-"""Points of a scan that registration uses at most: some one degree apart. More say little more of the pose."""
+POINTS = 181
+"""Points of a scan that registration uses at most: a degree apart, if it sees half of what is around. More say little
+more of the pose."""
 
 _NEIGHBOURS = 3  # on either side
 _FEWEST = 4  # points that a direction is taken from
@@ -34,13 +35,11 @@ def surface_of_scan(scan: Scan, points: int = POINTS) -> Surface:
 
     Args:
       scan: `N` beams.
-      points: how many of the beams are used at most, evenly spread.
-
-    Returns:
-      A surface of `ceil(N / ceil(N / points))` points.
+      points: slots for points; as many beams are used at most, evenly spread.
     """
     thinned = slice(None, None, -(-scan.ranges.shape[0] // points))
-    ranges, bearings, valid = scan.ranges[thinned], scan.bearings[thinned], scan.valid[thinned]
+    empty = (0, points - scan.ranges[thinned].shape[0])
+    ranges, bearings, valid = (jnp.pad(x[thinned], empty) for x in (scan.ranges, scan.bearings, scan.valid))
     position = jnp.where(valid[:, None], ranges[:, None] * unit(bearings), 0)
     near = (0.1 + 0.05 * ranges) ** 2
     steps = []
