@@ -81,7 +81,7 @@ class _Past(NamedTuple):
     begin: Array  # cost, if the line begins a polyline
     corner: Array  # cost, if it goes on from the line that ends at the start
     value: Array  # 1/r of that line there
-    extent: Array  # with a budget the variance of `value`; without one the derivative of 1/r by the angle
+    second: Array  # with a budget the variance of `value`; without one the derivative of 1/r by the angle
 
 
 class _Fit(NamedTuple):
@@ -168,23 +168,24 @@ def best_polyline(
 
         # What a line from each start to this point costs
         size = ordinal - start.place
-
-        u, t, det, htt, rss, turn = (x[None] for x in (fit.u, fit.t, fit.det, fit.htt, fit.rss, start.turn))
+        line, turn = _Fit(*(x[None] for x in fit)), start.turn[None]
 
         def coupled(value: Array, variance: Array) -> tuple[Array, Array]:
             """What the vertex adds, and whether it is in front of the scanner. Shape `[W, K]` or `[1, K]`."""
-            total = variance * det + htt
-            return (value - u) ** 2 * det / total, value * htt + u * variance * det > 0
+            total = variance * line.det + line.htt
+            in_front = value * line.htt + line.u * variance * line.det > 0
+            return (value - line.u) ** 2 * line.det / total, in_front
 
         def crossing(value: Array, slope: Array) -> tuple[Array, Array]:
             """The same of a corner where lines cross."""
-            apart = value - u
-            return jnp.zeros_like(u), (apart * (apart + (slope - t) * turn) <= 0) & (u + t * turn > 0)
+            apart = value - line.u
+            crosses = apart * (apart + (slope - line.t) * turn) <= 0
+            return jnp.zeros_like(line.u), crosses & (line.u + line.t * turn > 0)
 
         def cost_of(past: Array, vertex: tuple[Array, Array], least: int) -> Array:
-            return past + rss + jnp.where((size >= least)[None] & vertex[1], vertex[0], infinite)
+            return past + line.rss + jnp.where((size >= least)[None] & vertex[1], vertex[0], infinite)
 
-        at_corner = (coupled if budget else crossing)(past.value, past.extent)
+        at_corner = (coupled if budget else crossing)(past.value, past.second)
         corner = cost_of(past.corner, at_corner, min_points)
         begin = cost_of(past.begin, coupled(start.inverse[None], start.variance[None]), min_points - 1)
         each = jnp.minimum(corner, begin)
@@ -195,7 +196,7 @@ def best_polyline(
         at, f = _Start(*(x[which] for x in start)), _Fit(*(x[which] for x in fit))
         is_corner = corner[rows, which] < begin[rows, which]
         value = jnp.where(is_corner, past.value[rows, which] if budget else f.u, at.inverse)
-        variance = jnp.where(is_corner, past.extent[rows, which], at.variance) if budget else at.variance
+        variance = jnp.where(is_corner, past.second[rows, which], at.variance) if budget else at.variance
         c, s = _turn(at, point)
         total = variance * f.det + f.htt
         total = jnp.where(total > 0, total, 1)
@@ -204,20 +205,21 @@ def best_polyline(
         here = u * c + t * s
         if budget:
             spread = jnp.maximum(f.htt * c * c - 2 * f.hut * c * s + f.huu * s * s, 0)
-            extent = (spread * variance + s * s) / total
+            second = (spread * variance + s * s) / total
         else:
-            extent = t * c - u * s
+            second = t * c - u * s
         can_be = (cost < infinite) & (here > 0) & valid
         # Nothing is known of a line that cannot be.
-        here, extent = (jnp.where(can_be, y, 1) for y in (here, extent))
+        here, second = (jnp.where(can_be, y, 1) for y in (here, second))
         end = jnp.where(can_be, cost, infinite)
-        latest = _Past(begin=later(so_far, 2), corner=later(end, 1), value=moved(here), extent=moved(extent))
+        latest = _Past(begin=later(so_far, 2), corner=later(end, 1), value=moved(here), second=moved(second))
 
         left = so_far + jnp.where(valid, price, 0)
         is_end = end < left
         so_far = jnp.minimum(end, left)
 
-        # The next start takes the place of the one that promises least
+        # The next start takes the place of the one that promises least: its lines are dearer than the best ones, and
+        # the longer that is so, the less is there a corner.
         excess = jnp.min(jnp.where(cost[:, None] < infinite, each - cost[:, None], infinite), 0)
         excess = jnp.where(size < min_points, 0, excess) + penalty / 3 * jnp.log(size.astype(dtype))
         promise = _in_order(jnp.where(fit.rss < infinite, excess, infinite))
