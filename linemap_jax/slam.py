@@ -17,7 +17,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from linemap_jax.build import build
+from linemap_jax.build import STATIC, build
 from linemap_jax.core.estimation.adjustment import Sightings, adjust, sightings_of_scan, with_error_of_poses
 from linemap_jax.core.estimation.loops import Closure, LoopSettings, close_loop
 from linemap_jax.core.estimation.odometry import OdometryNoise
@@ -25,6 +25,7 @@ from linemap_jax.core.estimation.pose_graph import SURE, Closures, PoseGraph, co
 from linemap_jax.core.estimation.registration import RegistrationSettings
 from linemap_jax.core.estimation.surface import Surface, middle_of
 from linemap_jax.core.estimation.tracking import Track, Tracked, TrackingSettings, begin_track, track_chunk
+from linemap_jax.core.frames_on_host import between, compose
 from linemap_jax.core.settings import SensorNoise, Thresholds
 from linemap_jax.core.state import LineMap, Lines, Pose, Scan, pad_stack
 
@@ -216,7 +217,12 @@ class Slam:
         )
 
     def adjust(
-        self, line_map: LineMap, *, thresholds: Thresholds = Thresholds(), noise: SensorNoise = SensorNoise()
+        self,
+        line_map: LineMap,
+        *,
+        thresholds: Thresholds = Thresholds(),
+        noise: SensorNoise = SensorNoise(),
+        **options: Any,
     ) -> tuple[LineMap, Float[np.ndarray, "N 3 3"]]:
         """Let poses and lines settle together; from then on the trajectory is that of the adjustment.
 
@@ -224,6 +230,7 @@ class Slam:
           line_map: made from the scans at the poses of the trajectory.
           thresholds: of extraction and matching.
           noise: of the scanner.
+          **options: the remaining ones of `extract`, as the map was made with.
 
         Returns:
           The map, whose covariances now hold what the poses are uncertain by, too; and the covariances of the
@@ -241,7 +248,7 @@ class Slam:
                 cov=jnp.asarray(np.tile(cov, (size, 1, 1)), dtype),
             )
             piece = pad_stack((scans, poses, jnp.asarray(numbers[i : i + CHUNK])), CHUNK)
-            seen = _jit_sightings(*piece, line_map.lines, thresholds=thresholds, noise=noise)
+            seen = _jit_sightings(*piece, line_map.lines, thresholds=thresholds, noise=noise, **options)
             pieces.append(jax.tree.map(partial(_flat, size), seen))
         valid = np.concatenate([piece.valid for piece in pieces])
         seen = jax.tree.map(lambda *x: np.concatenate(x)[valid], *pieces)
@@ -358,12 +365,10 @@ _jit_error_of_poses = jax.jit(with_error_of_poses)
 _jit_middles = jax.jit(jax.vmap(middle_of))
 
 
-@jax.jit
-def _jit_sightings(
-    scans: Scan, poses: Pose, numbers: Array, lines: Lines, thresholds: Thresholds, noise: SensorNoise
-) -> Sightings:
+@partial(jax.jit, static_argnames=STATIC)
+def _jit_sightings(scans: Scan, poses: Pose, numbers: Array, lines: Lines, **options: Any) -> Sightings:
     def of_scan(x: tuple[Scan, Pose, Array]) -> Sightings:
-        return sightings_of_scan(*x[:2], lines, x[2], thresholds=thresholds, noise=noise)
+        return sightings_of_scan(*x[:2], lines, x[2], **options)
 
     return jax.lax.map(of_scan, (scans, poses, numbers))
 
@@ -425,23 +430,3 @@ def _spread(order: np.ndarray) -> Iterator[int]:
         if all(abs(j - k) > CANDIDATES_APART for k in taken):
             taken.append(j)
             yield j
-
-
-def compose(pose: Any, step: Any) -> np.ndarray:
-    """As `frames.compose`, in float64 on the host, for one pose or many."""
-    pose, step = np.asarray(pose, float), np.asarray(step, float)
-    c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
-    x = pose[..., 0] + c * step[..., 0] - s * step[..., 1]
-    y = pose[..., 1] + s * step[..., 0] + c * step[..., 1]
-    return np.stack([x, y, _wrapped(pose[..., 2] + step[..., 2])], -1)
-
-
-def between(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """As `frames.between`, in float64 on the host."""
-    c, s = np.cos(before[2]), np.sin(before[2])
-    dx, dy, turn = after - before
-    return np.array([c * dx + s * dy, -s * dx + c * dy, _wrapped(turn)])
-
-
-def _wrapped(angle: Any) -> Any:
-    return (angle + np.pi) % (2 * np.pi) - np.pi

@@ -175,13 +175,11 @@ def _steps(
     """Each pose of odometry seen from the one before, and what variances to add. In float64, however far they are."""
     import numpy as np
 
+    from linemap_jax.core.frames_on_host import between
     from linemap_jax.io.log import MAX_GAP
 
     places = np.concatenate([last[0][None], poses])
-    move, theta = np.diff(places, axis=0), places[:-1, 2]
-    c, s = np.cos(theta), np.sin(theta)
-    turn = (move[:, 2] + np.pi) % (2 * np.pi) - np.pi
-    steps = np.stack([c * move[:, 0] + s * move[:, 1], c * move[:, 1] - s * move[:, 0], turn], -1)
+    steps = between(places[:-1], places[1:])
     gap = np.diff(np.concatenate([[last[1]], timestamps])) > MAX_GAP
     return steps, gap[:, None] * np.square(GAP_SIGMA)
 

@@ -64,9 +64,9 @@ class Slam(LogOptions):
         again = opened(self, self.log)
         with progress(again, quiet=self.quiet):
             mapped = map_of_pieces(_at_poses(self, again, slammed.trajectory()), at_laser)
-        line_map, cov_keyframes = slammed.adjust(
-            mapped.line_map, thresholds=options["thresholds"], noise=options["noise"]
-        )
+        of_map = ("mount", "persistence", "pose_error")
+        of_extract = {name: option for name, option in options.items() if name not in of_map}
+        line_map, cov_keyframes = slammed.adjust(mapped.line_map, **of_extract)
         interrupted |= mapped.interrupted
         trajectory = slammed.trajectory()
 
@@ -97,6 +97,7 @@ def _tracked(command: Slam, log: "Log", mount: "Mount") -> tuple["Slammed", "np.
     import numpy as np
 
     from linemap_jax import slam
+    from linemap_jax.core.frames_on_host import compose
 
     slammed, stamps, interrupted = slam.Slam(), [], False
     on_robot = np.array([mount.x, mount.y, mount.theta], float)
@@ -108,7 +109,7 @@ def _tracked(command: Slam, log: "Log", mount: "Mount") -> tuple["Slammed", "np.
                     f"{log.path}: has scans without odometry; --standstill does without, --poses takes it from a file"
                 )
             stamps.append(chunk.timestamps)
-            slammed.add(chunk.scans, slam.compose(odometry, on_robot))
+            slammed.add(chunk.scans, compose(odometry, on_robot))
     except KeyboardInterrupt:
         if len(slammed.keyframes) == 0:
             raise
@@ -143,10 +144,10 @@ def _of_base(trajectory: "np.ndarray", mount: "Mount") -> "np.ndarray":
     """The poses of the robot that carries the laser."""
     import numpy as np
 
-    from linemap_jax import slam
+    from linemap_jax.core.frames_on_host import between, compose
 
     laser = np.array([mount.x, mount.y, mount.theta], float)
-    return slam.compose(trajectory, slam.between(laser, np.zeros(3)))
+    return compose(trajectory, between(laser, np.zeros(3)))
 
 
 def _tell_doubts(slammed: "Slammed", log: "Log", *, quiet: bool) -> None:

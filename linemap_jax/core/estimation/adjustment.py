@@ -54,9 +54,16 @@ class Adjusted(NamedTuple):
 
 
 def sightings_of_scan(
-    scan: Scan, pose: Pose, lines: Lines, keyframe: Int[Array, ""], *, thresholds: Thresholds, noise: SensorNoise
+    scan: Scan,
+    pose: Pose,
+    lines: Lines,
+    keyframe: Int[Array, ""],
+    *,
+    thresholds: Thresholds,
+    noise: SensorNoise,
+    **options: Any,
 ) -> Sightings:
-    """The lines of the map that a keyframe has seen: `SCAN_CAPACITY.lines` of them, padded.
+    """The lines of the map that a keyframe has seen, as many as the capacity of a scan, padded.
 
     Args:
       scan: of the keyframe.
@@ -65,8 +72,9 @@ def sightings_of_scan(
       keyframe: its number.
       thresholds: of extraction and matching.
       noise: of the scanner.
+      **options: the remaining ones of `extract`.
     """
-    found = extract(scan, pose, thresholds=thresholds, noise=noise)
+    found = extract(scan, pose, thresholds=thresholds, noise=noise, **options)
     slot, nis = best_line(found.lines, lines, thresholds, "independent")
     reverse = jnp.abs(wrap_angle(found.lines.angle - lines.angle[slot])) > jnp.pi / 2
     foot = found.lines.anchor + found.lines.offset[:, None] * found.lines.normal - pose.mean[None, :2]
