@@ -10,20 +10,20 @@ Floats = NDArray[np.float64]
 def compose(pose: ArrayLike, step: ArrayLike) -> Float[np.ndarray, "*s 3"]:
     """The pose that is reached from a pose by a step seen from there, both x, y, theta. m, m, rad."""
     pose, step = np.asarray(pose, float), np.asarray(step, float)
-    x, y = _turned(pose[..., 2], step)
-    return np.stack([pose[..., 0] + x, pose[..., 1] + y, _wrapped(pose[..., 2] + step[..., 2])], -1)
+    place = pose[..., :2] + _turned(pose[..., 2], step)
+    return np.concatenate([place, _wrapped(pose[..., 2:] + step[..., 2:])], -1)
 
 
 def between(before: ArrayLike, after: ArrayLike) -> Float[np.ndarray, "*s 3"]:
     """The step from one pose to another, seen from the first: `compose(before, step)` is `after`. m, m, rad."""
     before = np.asarray(before, float)
     move = np.asarray(after, float) - before
-    return np.stack([*_turned(-before[..., 2], move), _wrapped(move[..., 2])], -1)
+    return np.concatenate([_turned(-before[..., 2], move), _wrapped(move[..., 2:])], -1)
 
 
-def _turned(angle: Floats, step: Floats) -> tuple[Floats, Floats]:
+def _turned(angle: ArrayLike, step: Floats) -> Floats:
     c, s = np.cos(angle), np.sin(angle)
-    return c * step[..., 0] - s * step[..., 1], s * step[..., 0] + c * step[..., 1]
+    return np.stack([c * step[..., 0] - s * step[..., 1], s * step[..., 0] + c * step[..., 1]], -1)
 
 
 def _wrapped(angle: Floats) -> Floats:
