@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import jax.scipy.special
 from jaxtyping import Array, Bool, Float, Int
 
+from linemap_jax.core.branching import largest_of_batch
 from linemap_jax.core.frames import dot, perp
 from linemap_jax.core.propagation import apply, inverse, product, safe_sqrt, square_root, symmetric
 from linemap_jax.core.runs import Runs
@@ -26,6 +27,8 @@ MIN_FIT_POINTS = 5
 GAUSS_NEWTON_STEPS = 5
 """Without noise of the bearing the estimate has then converged to 0.001 sigma, from the algebraic start. Beams near the
 rim converge slowly: with 0.1 degree of noise 0.15 sigma are left, which costs nothing in the measured consistency."""
+FEW = 4
+"""Where no more than this part of the points may lie on poles, only these are looked at."""
 RIM = 0.5
 """How near to the rim, in sigmas of range and sway, a beam is taken to meet a pole at least. At the rim itself it would
 have all the weight, and where the rim is we do not know that well."""
@@ -225,10 +228,66 @@ def _fit_circles(
     circle = jnp.where(solvable[:, None], circle, jnp.ones_like(circle))
     laser = points.laser[None] - middle
 
+    # Most scans have few points that may lie on a pole, and the fit is a third of the work on a scan: only these are
+    # looked at where there is room for them.
+    worth = (clusters.of_point >= 0) & clusters.spread(solvable)
+    count, room = jnp.sum(worth), -(-worth.shape[0] // FEW)
+
+    def none(circle: Array) -> _Fit:
+        return _Fit(circle, jnp.zeros((*circle.shape, 3), circle.dtype), jnp.zeros_like(circle[:, 0]))
+
+    def few(circle: Array) -> _Fit:
+        index, some = clusters.only(worth, room)
+        return _most_likely(circle, z[index], points.beam[index], some, laser, noise)
+
+    def all_(circle: Array) -> _Fit:
+        return _most_likely(circle, z, points.beam, clusters, laser, noise)
+
+    choice = largest_of_batch((count > 0).astype(jnp.int32) + (count > room).astype(jnp.int32))
+    circle, cov, misfit = jax.lax.switch(choice, [none, few, all_], circle)
+
+    center, radius = circle[:, :2], circle[:, 2]
+    dof = jnp.maximum(n - 3, 1)
+    variances = jnp.diagonal(cov, axis1=-2, axis2=-1)
+    var_radius = variances[:, 2]
+    believed = (
+        solvable
+        & jnp.all(jnp.isfinite(circle), -1)
+        & jnp.all(jnp.isfinite(cov), (-1, -2))
+        & jnp.all(variances > 0, -1)  # rounding has the last word where the beams say nothing of a direction
+        # Smaller ones are lost in the noise. Held against the estimate itself, poles of just this radius would be kept
+        # if they seem too large and turned away if they seem too small, and come out too large.
+        & (radius + 3 * safe_sqrt(var_radius) >= 5 * noise.range_sigma)
+        & (radius < thresholds.cluster_distance)
+        & (dot(-laser, center) > 0)  # we see the near side of a pole, never its inside
+        & (misfit <= dof + 3 * jnp.sqrt(2 * dof))  # 3 sigma of chi-square
+        & (var_radius < (radius / 3) ** 2)
+    )
+    return center, radius, jnp.where(believed[:, None, None], cov, 0), believed
+
+
+class _Fit(NamedTuple):
+    """Circles fitted to some points."""
+
+    circle: Array  # x, y, radius of each, m
+    cov: Array  # of these
+    misfit: Array  # chi-square
+
+
+def _most_likely(
+    circle: Float[Array, "K 3"],
+    z: Float[Array, "N 2"],
+    beam: Float[Array, "N 2"],
+    clusters: Runs,
+    laser: Float[Array, "K 2"],
+    noise: SensorNoise,
+) -> _Fit:
+    """Gauss-Newton steps from given circles."""
+
     def normal_equations(circle: Array) -> tuple[Array, Array, Array]:
         """Information, its inverse times the gradient, and chi-square of the misfit."""
         mine = clusters.spread(jnp.concatenate([circle, laser], -1))
-        beams = _linearise(z, points.beam, mine[:, :3], mine[:, 3:], noise)
+        beams = _linearise(z, beam, mine[:, :3], mine[:, 3:], noise)
         weighted = beams.row * beams.weight[:, None]
         # Few columns: the sums are most of the time. The information stands in them as its upper triangle.
         per_point = [
@@ -249,25 +308,7 @@ def _fit_circles(
 
     circle = jax.lax.fori_loop(0, GAUSS_NEWTON_STEPS, step, circle)
     cov, _, misfit = normal_equations(circle)
-
-    center, radius = circle[:, :2], circle[:, 2]
-    dof = jnp.maximum(n - 3, 1)
-    variances = jnp.diagonal(cov, axis1=-2, axis2=-1)
-    var_radius = variances[:, 2]
-    believed = (
-        solvable
-        & jnp.all(jnp.isfinite(circle), -1)
-        & jnp.all(jnp.isfinite(cov), (-1, -2))
-        & jnp.all(variances > 0, -1)  # rounding has the last word where the beams say nothing of a direction
-        # Smaller ones are lost in the noise. Held against the estimate itself, poles of just this radius would be kept
-        # if they seem too large and turned away if they seem too small, and come out too large.
-        & (radius + 3 * safe_sqrt(var_radius) >= 5 * noise.range_sigma)
-        & (radius < thresholds.cluster_distance)
-        & (dot(-laser, center) > 0)  # we see the near side of a pole, never its inside
-        & (misfit <= dof + 3 * jnp.sqrt(2 * dof))  # 3 sigma of chi-square
-        & (var_radius < (radius / 3) ** 2)
-    )
-    return center, radius, jnp.where(believed[:, None, None], cov, 0), believed
+    return _Fit(circle, cov, misfit)
 
 
 class _Beams(NamedTuple):

@@ -1,5 +1,7 @@
 """Runs of consecutive points: which points belong to which, and sums over them."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -31,6 +33,27 @@ class Runs:
         _, running = jax.lax.scan(add, jnp.zeros_like(rows[0]), (rows, begins))
         total = jnp.where(self.valid[:, None], running[self.last], 0)
         return total.reshape(self.valid.shape[0], *per_point.shape[1:])
+
+    def only(self, which: Bool[Array, " N"], size: int) -> tuple[Int[Array, " M"], "Runs"]:
+        """Some of the points, moved together in `M = size` places, and the runs that they belong to.
+
+        Whole runs must be chosen, and no more than `size` points.
+
+        Returns:
+          The index of each point, `N` where there is none; the runs, in the same slots.
+        """
+        n = which.shape[0]
+        index = all_true(which, size)
+        rank = rank_of_true(which)
+        place = jnp.minimum(index, n - 1)
+        some = dataclasses.replace(
+            self,
+            first=jnp.minimum(rank[self.first], size - 1),
+            last=jnp.minimum(rank[self.last], size - 1),
+            valid=self.valid & which[self.first],
+            of_point=jnp.where(index < n, self.of_point[place], -1),
+        )
+        return place, some
 
     def spread(self, per_run: Float[Array, "K *s"]) -> Float[Array, "N *s"]:
         """The value of each point's run; something finite for points of no run."""

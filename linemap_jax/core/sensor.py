@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from linemap_jax.core.frames import rotate, unit, wrap_angle
 from linemap_jax.core.propagation import jacobian, propagate
 from linemap_jax.core.settings import Jacobians, Mount, SensorNoise
-from linemap_jax.core.slots import computed_once
+from linemap_jax.core.slots import computed_once, rank_of_true
 from linemap_jax.core.state import Pose, Scan, pytree
 
 
@@ -136,12 +136,9 @@ def points_from_scan(scan: Scan, pose: Pose, mount: Mount, *, jacobians: Jacobia
 
 
 def _in_order(scan: Scan) -> Int[Array, " N"]:
-    """The beams that returned, from the first one of the sweep on; `N` where there are no more.
-
-    One sort, as `all_true` of the beams turned back by `first`.
-    """
+    """The beams that returned, from the first one of the sweep on; `N` where there are no more."""
     n = scan.valid.shape[0]
-    beam = jnp.arange(n, dtype=jnp.int32) - scan.first.astype(jnp.int32)
-    sorted_ = jnp.sort(jnp.where(scan.valid, jnp.where(beam < 0, beam + n, beam), n))
-    back = sorted_ + scan.first.astype(jnp.int32)
-    return jnp.where(sorted_ < n, jnp.where(back < n, back, back - n), n)
+    rank, count = rank_of_true(scan.valid), jnp.sum(scan.valid, dtype=jnp.int32)
+    rank = rank - rank[scan.first]
+    place = jnp.where(scan.valid, jnp.where(rank < 0, rank + count, rank), n)
+    return jnp.full(n, n, jnp.int32).at[place].set(jnp.arange(n, dtype=jnp.int32), mode="drop")
