@@ -1,23 +1,26 @@
-"""How long a scan takes, beside a scalar C++ extractor of section 4 in the same run.
+"""How long a scan takes, beside a scalar C++ extractor of section 4 and a plain NumPy one in the same run.
 
-Usage: python scripts/bench.py [--quick] [--json FILE]
+Usage: python scripts/bench.py [--quick] [--json FILE] [--write]
 
 Rows:
 
-- extract: one scan, or a batch of them (`vmap` in pieces of 256), into lines and circles.
+- extract: one scan, or a batch of them, into lines and circles. On a CPU the scans of a batch are taken one after the
+  other in a compiled loop (`lax.map`), which is faster there than side by side (`vmap`); elsewhere side by side.
 - map_step: the lines and circles of a scan (at most 20 and 9) into a map that holds 100 of each, inside `lax.scan`.
 - scan_to_map: both, over a whole log, inside `lax.scan`.
 
 Scans are the real ones of $LINEMAP_DATA/ple/scans.npz (default ../shared/data), and for scan_to_map those of the Intel
 log; where these are not there, simulated ones. The C++ extractor is compiled from $LINEMAP_BASELINE (default
 ../shared/tools/baseline), where it and g++ are there, and timed on the same scans on one core after each row; the
-ratio is the time of the row over that. On a CPU everything runs on one core, but for the rows with more devices.
-With --json each row is an object: name, preset, batch, dtype, devices, capacity, us_per_scan (the median), spread (the
-range of the middle half), cpu_us_per_scan (of the process), ratio_to_cpp, compile_s, cached_s (compiled code from the
-cache on the disk), peak_mb (of the process so far).
+ratio is the time of the row over that. The NumPy one is tests/oracle.py. On a CPU everything runs on one core, but for
+the rows with more devices. With --write the table goes into README, between its markers. With --json each row is an
+object: name, preset, scans ("real" or "simulated"), batch, dtype, devices, capacity, us_per_scan (the median), spread
+(the range of the middle half), cpu_us_per_scan (of the process), ratio_to_cpp, ratio_to_numpy, compile_s, cached_s
+(compiled code from the cache on the disk), peak_mb (of the process so far).
 """
 
 import argparse
+import importlib
 import json
 import os
 import platform
@@ -43,22 +46,25 @@ jax.config.update("jax_num_cpu_devices", len(CORES))
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 from jax.sharding import Mesh, NamedSharding, PartitionSpec  # noqa: E402
+from readme import write_part  # noqa: E402
 
-from linemap_jax import Capacity, Pose, Scan, empty_map, extract, preset, update  # noqa: E402
+from linemap_jax import Capacity, Mount, Pose, Scan, SensorNoise, build, empty_map, extract, preset, update  # noqa: E402
 from linemap_jax.build import COMPILER_OPTIONS  # noqa: E402
 from linemap_jax.core.extract import observe, with_defaults  # noqa: E402
 from linemap_jax.core.mapping import integrate  # noqa: E402
-from linemap_jax.core.settings import persistence_of  # noqa: E402
+from linemap_jax.core.settings import SCAN_CAPACITY, persistence_of  # noqa: E402
 from linemap_jax.core.slots import resize  # noqa: E402
 from linemap_jax.io.log import open_log  # noqa: E402
 from linemap_jax.io.scans import chunks_of_readings  # noqa: E402
 from linemap_jax.lab import generators, scanners, simulate  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "tests"))
+oracle: Any = importlib.import_module("oracle")
 DATA = Path(os.environ.get("LINEMAP_DATA", ROOT / "../shared/data"))
 BASELINE = Path(os.environ.get("LINEMAP_BASELINE", ROOT / "../shared/tools/baseline"))
-PIECE = 256
-"""Scans that are worked on side by side."""
+SIDE_BY_SIDE = None if jax.default_backend() == "cpu" else 4096
+"""Scans of a batch that are worked on at once; one after the other on a CPU."""
 SIGMAS = (0.05, 0.05, 0.0175)
 """Of the pose, m m rad."""
 SEED = 3
@@ -70,45 +76,60 @@ Row = dict[str, Any]
 def main() -> int:
     """Measure, print the table, and write the rows where that is asked for."""
     parser = argparse.ArgumentParser(description="How long a scan takes, beside a C++ extractor.")
-    parser.add_argument("--quick", action="store_true", help="three rows, within a minute")
+    parser.add_argument("--quick", action="store_true", help="four rows, within a minute")
     parser.add_argument("--json", type=Path, help="write the rows to this file")
+    parser.add_argument("--write", action="store_true", help="write the table into README")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         jax.config.update("jax_compilation_cache_dir", folder)
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         rows = list(measure(options.quick, Cpp.compiled(Path(folder))))
-    print(as_table(rows))
+    table = as_table(rows)
+    print(table)
     if options.json:
         options.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    if options.write:
+        write_part("speed", table)
     return 0
 
 
 def measure(quick: bool, cpp: "Cpp | None") -> Any:
     """The rows, one after the other; each is said on stderr."""
-    stills, log = still_scans(), driven_scans()
-    beside = {"stills": cpp and cpp.of(stills), "log": cpp and cpp.of(log[0])}
-    types = ("float32",) if quick else ("float32", "float64")
-    presets: tuple[Preset, ...] = ("default",) if quick else ("default", "paper")
-    for dtype in types:
+    drive = simulated_drive(130, "float64")
+    real, log = still_scans(), driven_scans()
+    stills = {"real": real} if real is not None else {}
+    if not quick or not stills:
+        stills["simulated"] = drive[0]
+    cpp_stills = {kind: cpp and cpp.of(scans) for kind, scans in stills.items()}
+    cpp_drive, cpp_log = cpp and cpp.of(drive[0]), cpp and log and cpp.of(log[0])
+    presets: tuple[Preset, ...] = ("paper",) if quick else ("paper", "default")
+    for kind, scans in stills.items():
         for choice in presets:
-            for batch in (1, 256) if quick else (1, 64, 256, 1024, 4096):
-                yield told(extraction(stills, batch, dtype, choice), beside["stills"])
-        if not quick and len(CORES) > 1:
-            yield told(extraction(stills, 4096, dtype, "default", devices=len(CORES)), beside["stills"])
+            numpy = numpy_extractor(scans, choice)
+            for dtype in ("float32",) if quick else ("float32", "float64"):
+                batches = (1, 256) if quick else (1, 64, 256, 1024, 4096) if kind == "real" else (1, 1024)
+                for batch in batches:
+                    row = extraction(scans, batch, dtype, choice, quick=quick) | {"scans": kind}
+                    yield told(row, cpp_stills[kind], numpy)
+                if not quick and len(CORES) > 1 and kind == "real":
+                    row = extraction(scans, 4096, dtype, choice, devices=len(CORES)) | {"scans": kind}
+                    yield told(row, cpp_stills[kind], numpy)
+    for dtype in ("float32",) if quick else ("float32", "float64"):
         for capacity in (128,) if quick else (64, 128, 256, 512, 1024, 2048):
-            yield told(map_step(capacity, dtype), beside["stills"])
+            yield told(map_step(drive, capacity, dtype, quick=quick) | {"scans": "simulated"}, cpp_drive)
         for choice in presets:
-            yield told(scan_to_map(log, dtype, choice), beside["log"])
+            given, kind, beside = (log, "real", cpp_log) if log else (drive, "simulated", cpp_drive)
+            yield told(scan_to_map(given, dtype, choice, quick=quick) | {"scans": kind}, beside)
 
 
-def extraction(scans: Scan, batch: int, dtype: str, choice: Preset, devices: int = 1) -> Row:
+def extraction(scans: Scan, batch: int, dtype: str, choice: Preset, devices: int = 1, *, quick: bool = False) -> Row:
     """A row of `extract`."""
     some = cast(jax.tree.map(lambda x: x[np.arange(batch) % x.shape[0]], scans), dtype)
     here = pose_at(dtype)
     one = partial(extract, jacobians="analytic", **preset(choice))
 
     def several(scans: Scan) -> Any:
-        return jax.lax.map(lambda scan: one(scan, here), scans, batch_size=min(batch, PIECE))
+        return jax.lax.map(lambda scan: one(scan, here), scans, batch_size=SIDE_BY_SIDE)
 
     if batch == 1:
         run, given = (lambda scan: one(scan, here)), jax.tree.map(lambda x: x[0], some)
@@ -120,16 +141,14 @@ def extraction(scans: Scan, batch: int, dtype: str, choice: Preset, devices: int
         run = jax.shard_map(several, mesh=mesh, in_specs=split, out_specs=split, check_vma=False)
         given = jax.device_put(some, NamedSharding(mesh, split))
     row = {"name": "extract", "preset": choice, "batch": batch, "dtype": dtype, "devices": devices, "capacity": None}
-    return row | timed(run, given, scans=batch, cores=devices)
+    return row | timed(run, given, scans=batch, cores=devices, quick=quick)
 
 
-def map_step(capacity: int, dtype: str) -> Row:
+def map_step(drive: tuple[Scan, Pose], capacity: int, dtype: str, *, quick: bool) -> Row:
     """A row of `map_step`: a map of a simulated drive, thinned out, and a scan of it, again and again."""
-    scans, poses = simulated_drive(60, dtype)
-    line_map = empty_map(Capacity(256, 256), np.dtype(dtype))
-    step = jax.jit(partial(update, jacobians="analytic"))
-    for t in range(60):
-        line_map, _ = step(line_map, *jax.tree.map(lambda x, t=t: x[t], (scans, poses)))
+    scans, poses = cast(drive, dtype)
+    start = jax.tree.map(lambda x: x[:64], (scans, poses))
+    line_map, _ = build(*start, map_capacity=Capacity(256, 256), jacobians="analytic")
     held = min(100, capacity)
     line_map = jax.tree.map(jnp.asarray, filled(line_map, held))
     line_map = type(line_map)(lines=resize(line_map.lines, capacity), circles=resize(line_map.circles, capacity))
@@ -157,10 +176,10 @@ def map_step(capacity: int, dtype: str) -> Row:
         return jax.lax.scan(step, line_map, None, length=64)
 
     row = {"name": "map_step", "preset": "default", "batch": 1, "dtype": dtype, "devices": 1, "capacity": capacity}
-    return row | timed(several, line_map, found, scans=64, options=COMPILER_OPTIONS)
+    return row | timed(several, line_map, found, scans=64, options=COMPILER_OPTIONS, quick=quick)
 
 
-def scan_to_map(log: tuple[Scan, Pose], dtype: str, choice: Preset) -> Row:
+def scan_to_map(log: tuple[Scan, Pose], dtype: str, choice: Preset, *, quick: bool) -> Row:
     """A row of `scan_to_map`."""
     scans, poses = cast(log, dtype)
     count = scans.ranges.shape[0]
@@ -175,11 +194,13 @@ def scan_to_map(log: tuple[Scan, Pose], dtype: str, choice: Preset) -> Row:
     capacity = Capacity(512, 512)
     row = {"name": "scan_to_map", "preset": choice, "batch": 1, "dtype": dtype, "devices": 1, "capacity": 512}
     given = empty_map(capacity, np.dtype(dtype)), scans, poses
-    return row | timed(several, *given, scans=count, options=COMPILER_OPTIONS)
+    return row | timed(several, *given, scans=count, options=COMPILER_OPTIONS, quick=quick)
 
 
-def timed(function: Callable[..., Any], *given: Any, scans: int, cores: int = 1, options: Any = None) -> Row:
-    """Compile twice, the second time from the cache, and run for a second or so."""
+def timed(
+    function: Callable[..., Any], *given: Any, scans: int, cores: int = 1, options: Any = None, quick: bool = False
+) -> Row:
+    """Compile, once more from the cache unless it has to be quick, and run for a second or so."""
 
     def compiled_in() -> tuple[Callable[..., Any], float]:
         jax.clear_caches()
@@ -188,7 +209,8 @@ def timed(function: Callable[..., Any], *given: Any, scans: int, cores: int = 1,
         return compiled, time.perf_counter() - begin
 
     on_cores(len(CORES))
-    (_, cold), (compiled, warm) = compiled_in(), compiled_in()
+    compiled, cold = compiled_in()
+    compiled, warm = (compiled, None) if quick else compiled_in()
     on_cores(cores)
     spans, used = [], []
     jax.block_until_ready(compiled(*given))
@@ -208,9 +230,10 @@ def timed(function: Callable[..., Any], *given: Any, scans: int, cores: int = 1,
     }
 
 
-def told(row: Row, cpp: Callable[[], float] | None) -> Row:
-    """The row with its ratio to the C++ extractor, which is timed once more."""
+def told(row: Row, cpp: Callable[[], float] | None, numpy: float | None = None) -> Row:
+    """The row with its ratio to the C++ extractor, which is timed once more, and to the NumPy one, in us a scan."""
     row["ratio_to_cpp"] = row["us_per_scan"] / cpp() if cpp else None
+    row["ratio_to_numpy"] = row["us_per_scan"] / numpy if numpy else None
     print(json.dumps(row), file=sys.stderr, flush=True)
     return row
 
@@ -260,11 +283,37 @@ class Cpp:
         return time_it
 
 
-def still_scans() -> Scan:
-    """Real scans of many places; simulated ones where they are not there."""
+def numpy_extractor(scans: Scan, choice: Preset) -> float:
+    """What the plain NumPy extractor takes a scan, us; the median of ten scans."""
+    on_cores(1)
+    pose, options = pose_at("float64"), preset(choice)
+    spans = []
+    for i in range(0, 100, 10):
+        ranges, bearings, valid = (np.asarray(x[i]) for x in (scans.ranges, scans.bearings, scans.valid))
+        begin = time.perf_counter()
+        oracle.extract(
+            ranges,
+            bearings,
+            valid,
+            float(scans.spacing[i]),
+            np.asarray(pose.mean),
+            np.asarray(pose.cov),
+            thresholds=options["thresholds"],
+            noise=SensorNoise(),
+            mount=Mount(),
+            rules=options["rules"],
+            covariance=options["covariance"],
+            capacity=SCAN_CAPACITY,
+        )
+        spans.append(time.perf_counter() - begin)
+    return 1e6 * statistics.median(spans)
+
+
+def still_scans() -> Scan | None:
+    """Real scans of many places, if they are there."""
     path = DATA / "ple/scans.npz"
     if not path.exists():
-        return simulated_drive(130, "float64")[0]
+        return None
     data = np.load(path)
     bearings, ranges, limits = (data[f"real_{name}"] for name in ("azimuth", "range", "rlim"))
     valid = (ranges >= limits[:, :1]) & (ranges <= limits[:, 1:])  # beams that pad a scan are NaN
@@ -277,11 +326,11 @@ def still_scans() -> Scan:
     )
 
 
-def driven_scans() -> tuple[Scan, Pose]:
-    """A log with poses: Intel's, or a simulated one where it is not there."""
+def driven_scans() -> tuple[Scan, Pose] | None:
+    """A log with poses, Intel's, if it is there."""
     path = DATA / "carmen/intel-corrected.log.gz"
     if not path.exists():
-        return simulated_drive(300, "float64")
+        return None
     cov = np.diag(np.square(SIGMAS))
     (chunk,) = chunks_of_readings(open_log(path), 10**6, cov_pose=cov, dtype="float64")
     return chunk.scans, chunk.poses
@@ -325,18 +374,32 @@ def filled(line_map: Any, count: int) -> Any:
 
 def as_table(rows: list[Row]) -> str:
     """The rows as Markdown."""
-    columns = ("", "preset", "batch", "devices", "capacity", "dtype", "us a scan", "middle half", "times C++")
-    columns += ("CPU us", "compiled in, s", "from cache, s")
-    lines = [f"{platform.machine()}, {len(CORES)} cores, {jax.devices()[0].device_kind}, jax {jax.__version__}.", ""]
-    lines += [f"| {' | '.join(columns)} |", "| --- | --- " + "| ---: " * (len(columns) - 2) + "|"]
+    columns = ("", "preset", "scans", "batch", "cores", "capacity", "dtype", "us a scan", "middle half", "times C++")
+    columns += ("times NumPy", "CPU us", "compiled in, s", "from cache, s", "peak MB")
+    lines = [f"{processor()}, {len(CORES)} cores, {jax.devices()[0].device_kind}, jax {jax.__version__}.", ""]
+    lines += [f"| {' | '.join(columns)} |", "| --- | --- | --- " + "| ---: " * (len(columns) - 3) + "|"]
+
+    def number(x: float | None, digits: int) -> str:
+        return "" if x is None else f"{x:.{digits}f}"
+
     for row in rows:
         low, high = row["spread"]
-        cells = [row["name"], row["preset"], row["batch"], row["devices"], row["capacity"] or "", row["dtype"]]
-        cells += [f"{row['us_per_scan']:.1f}", f"{low:.1f} to {high:.1f}"]
-        cells += ["" if row["ratio_to_cpp"] is None else f"{row['ratio_to_cpp']:.1f}"]
-        cells += [f"{row['cpu_us_per_scan']:.1f}", f"{row['compile_s']:.1f}", f"{row['cached_s']:.1f}"]
+        cells = [row["name"], row["preset"], row["scans"], row["batch"], row["devices"], row["capacity"] or ""]
+        cells += [row["dtype"], number(row["us_per_scan"], 1), f"{low:.1f} to {high:.1f}"]
+        cells += [number(row["ratio_to_cpp"], 1), number(row["ratio_to_numpy"], 4), number(row["cpu_us_per_scan"], 1)]
+        cells += [number(row["compile_s"], 1), number(row["cached_s"], 1), number(row["peak_mb"], 0)]
         lines.append(f"| {' | '.join(map(str, cells))} |")
     return "\n".join(lines)
+
+
+def processor() -> str:
+    """What the machine calls its processor."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.machine()
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()
 
 
 if __name__ == "__main__":

@@ -27,6 +27,7 @@ from typing import Any, Literal
 
 import jax
 import numpy as np
+from readme import write_part
 from tqdm import tqdm
 
 from linemap_jax import Capacity, Mount, SensorNoise, empty_map, extract, preset, update
@@ -46,7 +47,6 @@ SCAN, MAP = Capacity(64, 96), Capacity(512, 512)
 CHUNK = 256
 COLUMNS = ("log", "preset", "scans", "lines equal", "unequal scans", "estimate", "covariance", "map")
 COLUMNS += ("only sequential", "only simultaneous")
-BEGIN, END = "<!-- oracle:begin -->", "<!-- oracle:end -->"
 
 
 def main() -> int:
@@ -76,9 +76,7 @@ def main() -> int:
     table = "\n".join([f"| {' | '.join(COLUMNS)} |", "| --- | --- " + "| ---: " * (len(COLUMNS) - 2) + "|", *rows])
     print(table)
     if options.write and rows:
-        readme = ROOT / "README.md"
-        before, rest = readme.read_text().split(BEGIN)
-        readme.write_text(f"{before}{BEGIN}\n{table}\n{END}{rest.split(END)[1]}")
+        write_part("oracle", table)
     return 0
 
 

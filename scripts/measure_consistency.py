@@ -15,12 +15,12 @@ import time
 import zlib
 from collections.abc import Callable, Iterable
 from functools import partial
-from pathlib import Path
 from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from readme import write_part
 from tqdm import tqdm
 
 from linemap_jax import preset
@@ -30,7 +30,6 @@ from linemap_jax.lab.batch import mesh_of_devices, run_batch
 from linemap_jax.lab.consistency import Cell, Fit, Model, Sample, Verdict, judge
 from linemap_jax.lab.scanners import Scanner, sweep
 
-README = Path(__file__).resolve().parents[1] / "README.md"
 BATCH = 250
 """Runs that are simulated side by side; their arrays stay in the cache of a core."""
 FUSED_NOISE = "; 0.01 m, 0.1 degree; "
@@ -68,15 +67,8 @@ def main() -> int:
             minutes = (time.perf_counter() - begin) / 60
             print(f"{table}\n\nin {minutes:.0f} minutes on {options.devices} cores\n", flush=True)
             if options.write:
-                _write(name, table)
+                write_part(f"consistency-{name}", table)
     return 0
-
-
-def _write(name: str, table: str) -> None:
-    """Put a table into README, between its markers."""
-    begin, end = (f"<!-- consistency-{name}:{edge} -->" for edge in ("begin", "end"))
-    before, rest = README.read_text().split(begin)
-    README.write_text(f"{before}{begin}\n{table}\n{end}{rest.split(end)[1]}")
 
 
 def single_scans(runs: int) -> str:

@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from readme import write_part
 
 from linemap_jax.cli import main as linemap
 from linemap_jax.io.carmen import assumed_sweep
@@ -32,7 +33,6 @@ DATA = Path(os.environ.get("LINEMAP_DATA", ROOT / "../shared/data"))
 LOGS = {"intel": "Intel", "freiburg-079": "FR079", "aces": "ACES", "fhw": "FHW"}
 STARTS = ((0.35, -0.35, 0.17), (-0.5, 0.0, -0.17))
 """What the start is wrong by, m m rad: half a metre and 10 degrees."""
-BEGIN, END = "<!-- localization:begin -->", "<!-- localization:end -->"
 
 Floats = NDArray[np.float64]
 
@@ -55,11 +55,7 @@ def main() -> int:
                 table.append(f"| {title} | {told(off)} | " + " | ".join(measure(Path(folder), corrected, off)) + " |")
                 print(table[-1], flush=True)
     if "--write" in sys.argv[1:] and len(table) > 2:
-        readme = ROOT / "README.md"
-        before, rest = readme.read_text(encoding="utf-8").split(BEGIN)
-        after = rest.split(END)[1]
-        text = "\n".join(table)
-        readme.write_text(f"{before}{BEGIN}\n{text}\n{END}{after}", encoding="utf-8")
+        write_part("localization", "\n".join(table))
     return 0
 
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from readme import write_part
 
 from linemap_jax import Capacity, build, preset
 from linemap_jax.io.log import open_log
@@ -31,7 +32,6 @@ WAYS: dict[str, dict[str, Any]] = {
     "paper": preset("paper"),
 }
 """Presets, and one with the other segmentation."""
-BEGIN, END = "<!-- measured:begin -->", "<!-- measured:end -->"
 
 
 def main() -> int:
@@ -50,10 +50,7 @@ def main() -> int:
     columns += ("duplicates", "time a scan")
     table = "\n".join([f"| {' | '.join(columns)} |", "| --- | --- " + "| ---: " * 9 + "|", *rows])
     if "--write" in sys.argv[1:] and rows:
-        readme = ROOT / "README.md"
-        before, rest = readme.read_text().split(BEGIN)
-        after = rest.split(END)[1]
-        readme.write_text(f"{before}{BEGIN}\n{table}\n{END}{after}")
+        write_part("measured", table)
     return 0
 
 

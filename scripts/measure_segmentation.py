@@ -30,6 +30,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from readme import write_part
 
 from linemap_jax import Extraction, Mount, Pose, Scan, SensorNoise, Thresholds, extract
 from linemap_jax.core.frames import dot, unit
@@ -39,12 +40,10 @@ from linemap_jax.core.segmentation.polyline import best_polyline
 from linemap_jax.core.sensor import points_from_scan
 
 ROOT = Path(__file__).resolve().parents[1]
-README = ROOT / "README.md"
 FOUND = ROOT / "notebooks/segmentation.json"
 """The same figures, for the notebook."""
 SCANS = Path(os.environ.get("LINEMAP_DATA", ROOT / "../shared/data")) / "ple/scans.npz"
 TOOL = Path(os.environ.get("LINEMAP_TOOLS", ROOT / "../shared/tools")) / "score.py"
-BEGIN, END = "<!-- segmentation:begin -->", "<!-- segmentation:end -->"
 METRICS = {"real": ("rmse", "f", "fnr"), "sim": ("rmse", "a", "f")}
 LONG = {
     "rmse": "rmse, m",
@@ -319,8 +318,7 @@ def main() -> int:
     print(text)
     if options.write:
         FOUND.write_text(json.dumps({"budgets": budgets, **found}, indent=1).replace("NaN", "null") + "\n")
-        before, rest = README.read_text().split(BEGIN)
-        README.write_text(f"{before}{BEGIN}\n{text}\n{END}{rest.split(END)[1]}")
+        write_part("segmentation", text)
     return 0
 
 

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from readme import write_part
 
 from linemap_jax.io.log import open_log
 
@@ -26,7 +27,6 @@ DATA = Path(os.environ.get("LINEMAP_DATA", ROOT / "../shared/data"))
 TOOLS = Path(os.environ.get("LINEMAP_TOOLS", ROOT / "../shared/tools"))
 LOGS = {"aces": ("ACES", 0.060, 0.044), "fr079": ("FR079", 0.061, 0.056)}
 """Bags, their titles, and what GMapping and graph mapping reach (Kuemmerle et al. 2009), m."""
-BEGIN, END = "<!-- slam:begin -->", "<!-- slam:end -->"
 
 
 def main() -> int:
@@ -44,10 +44,7 @@ def main() -> int:
     table = "\n".join([f"| {' | '.join(columns)} |", "| --- " + "| ---: " * (len(columns) - 1) + "|", *rows])
     print(table)
     if "--write" in sys.argv[1:] and rows:
-        readme = ROOT / "README.md"
-        before, rest = readme.read_text().split(BEGIN)
-        after = rest.split(END)[1]
-        readme.write_text(f"{before}{BEGIN}\n{table}\n{END}{after}")
+        write_part("slam", table)
     return 0
 
 

@@ -8,12 +8,12 @@ is taken at 25, 50, 75 and 100 m, that of the lines on one wall for each run. Wi
 
 import argparse
 import math
-from pathlib import Path
 from statistics import NormalDist
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from readme import write_part
 
 from linemap_jax.core.frames import compose, wrap_angle
 from linemap_jax.core.state import Lines, pad_stack
@@ -23,8 +23,6 @@ from linemap_jax.lab.scanners import noise_of, pls
 from linemap_jax.lab.simulate import Simulation, simulate
 from linemap_jax.slam import Slammed, slam
 
-ROOT = Path(__file__).resolve().parents[1]
-BEGIN, END = "<!-- slam-consistency:begin -->", "<!-- slam-consistency:end -->"
 SCANS = 400
 PLACES = (25.0, 50.0, 75.0, 100.0)
 WALLS = Walls(
@@ -55,9 +53,7 @@ def main() -> None:
     table = table_of(np.array(poses), np.array(lines), np.array(errors))
     print(table)
     if options.write:
-        readme = ROOT / "README.md"
-        before, rest = readme.read_text().split(BEGIN)
-        readme.write_text(f"{before}{BEGIN}\n{table}\n{END}{rest.split(END)[1]}")
+        write_part("slam-consistency", table)
 
 
 @jax.jit

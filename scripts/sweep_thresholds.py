@@ -15,11 +15,12 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from readme import write_part
+
 from linemap_jax import Thresholds
 from linemap_jax.lab.scanners import PRESETS
 
 ROOT = Path(__file__).resolve().parents[1]
-BEGIN, END = "<!-- thresholds:begin -->", "<!-- thresholds:end -->"
 KEPT = ("threshold", "value", "cost", "difference", "error")
 NAMES = (
     *("gap_distance", "gap_spacings", "gap_sigmas", "gap_beams", "line_distance", "line_sigmas"),
@@ -40,9 +41,7 @@ def main() -> int:
     text = table(sweeps, options.drives)
     print(text)
     if options.write:
-        readme = ROOT / "README.md"
-        before, rest = readme.read_text().split(BEGIN)
-        readme.write_text(f"{before}{BEGIN}\n{text}\n{END}{rest.split(END)[1]}")
+        write_part("thresholds", text)
         curves = {
             name: [{key: row[key] for key in KEPT} for row in found["variants"]] for name, found in sweeps.items()
         }

@@ -9,12 +9,12 @@ import sys
 from collections.abc import Iterable
 from pathlib import Path
 
+from readme import write_part
+
 from linemap_jax.lab.verification import Row, as_markdown, as_text, citations, verify
 
 ROOT = Path(__file__).resolve().parents[1]
-README = ROOT / "README.md"
 OF_ALL = "tests/lab/test_verification.py"
-BEGIN, END = "<!-- equations:begin -->", "<!-- equations:end -->"
 
 
 def main() -> int:
@@ -25,9 +25,7 @@ def main() -> int:
         print("README stays as it is: not all checks have passed", file=sys.stderr)
         return 1
     if "--write" in sys.argv[1:]:
-        before, rest = README.read_text(encoding="utf-8").split(BEGIN)
-        after = rest.split(END)[1]
-        README.write_text(f"{before}{BEGIN}\n{part_of_readme(rows)}\n{END}{after}", encoding="utf-8")
+        write_part("equations", part_of_readme(rows))
     return 0
 
 

@@ -244,7 +244,8 @@ def _fit_circles(
         return _most_likely(circle, z, points.beam, clusters, laser, noise)
 
     choice = largest_of_batch((count > 0).astype(jnp.int32) + (count > room).astype(jnp.int32))
-    circle, cov, misfit = jax.lax.switch(choice, [none, few, all_], circle)
+    fit: _Fit = jax.lax.switch(choice, [none, few, all_], circle)
+    circle, cov, misfit = fit
 
     center, radius = circle[:, :2], circle[:, 2]
     dof = jnp.maximum(n - 3, 1)

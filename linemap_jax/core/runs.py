@@ -4,7 +4,7 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from linemap_jax.core.slots import all_true, rank_of_true
 from linemap_jax.core.state import pytree
@@ -55,7 +55,7 @@ class Runs:
         )
         return place, some
 
-    def spread(self, per_run: Float[Array, "K *s"]) -> Float[Array, "N *s"]:
+    def spread(self, per_run: Shaped[Array, "K *s"]) -> Shaped[Array, "N *s"]:
         """The value of each point's run; something finite for points of no run."""
         return per_run[self.of_point]
 

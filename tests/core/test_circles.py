@@ -10,7 +10,7 @@ import pytest
 from scipy import optimize
 
 from linemap_jax import Capacity, Extraction, Rules, Thresholds, empty_map, extract, update
-from linemap_jax.core.circles import jac_arc_points, near_lines
+from linemap_jax.core.circles import FEW, jac_arc_points, near_lines
 from linemap_jax.core.runs import Runs
 from linemap_jax.core.settings import Jacobians, SensorNoise
 from linemap_jax.core.state import Circles, Pose, Scan, empty_circles, empty_lines
@@ -194,6 +194,26 @@ def test_an_inside_corner_is_no_pole() -> None:
     # Seen from inside, the arc bends the other way.
     bowl = 2.0 + 0.15 - (pole((2.0, 0.0), 0.15) - 1.85)
     assert not only(extracted(bowl, fit=True))["fitted"]
+
+
+def test_poles_of_few_beams_are_fitted_as_those_of_many() -> None:
+    """By other ways: by none where nothing is to be fitted, by the points of the poles alone where these are few."""
+    noise = 0.003 * np.random.default_rng(5).standard_normal(N)
+    ranges = [np.full(N, np.nan), pole((4.0, 0.3), 0.15) + noise, pole((2.0, 0.0), 0.15) + noise]
+    assert [int(np.isfinite(r).sum() > 0) + int(np.isfinite(r).sum() > N / FEW) for r in ranges] == [0, 1, 2]
+    alone = [extracted(r, fit=True).circles for r in ranges]
+    scans = jax.tree.map(lambda *x: jnp.stack(x), *(Scan.from_ranges(r, BEARINGS) for r in ranges))
+
+    def fit(scan: Scan) -> Circles:
+        return extract(scan, HERE, noise=NOISE, capacity=CAPACITY, jacobians="analytic").circles
+
+    # A batch goes one way, that of the scan which needs most.
+    together = jax.jit(jax.vmap(fit))(scans)
+    assert [int(circles.fitted.sum()) for circles in alone] == [0, 1, 1]
+    for name in ("valid", "fitted", "center", "radius", "cov_independent"):
+        expected = np.stack([getattr(circles, name) for circles in alone])
+        np.testing.assert_allclose(getattr(together, name), expected, rtol=1e-9, atol=1e-15, err_msg=name)
+    assert "cond[" in str(jax.make_jaxpr(jax.vmap(fit))(scans)), "all ways are gone by all"
 
 
 def test_clusters_of_one_point_are_no_circles() -> None:
