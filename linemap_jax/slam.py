@@ -18,7 +18,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from linemap_jax.build import STATIC, build
-from linemap_jax.core.estimation.adjustment import Sightings, adjust, sightings_of_scan, with_error_of_poses
+from linemap_jax.core.estimation.adjustment import LineSightings, adjust, sightings_of_scan, with_error_of_poses
 from linemap_jax.core.estimation.loops import Closure, LoopSettings, close_loop
 from linemap_jax.core.estimation.odometry import OdometryNoise
 from linemap_jax.core.estimation.pose_graph import SURE, Closures, PoseGraph, cov_of_registration, optimise
@@ -257,7 +257,7 @@ class Slam:
         place[used] = np.arange(len(used))
         m, k = _tight(valid.sum()), _tight(len(used))
         with jax.enable_x64(True):
-            sightings = Sightings(
+            sightings = LineSightings(
                 keyframe=_filled(seen.keyframe, m, (), int),
                 line=_filled(place[seen.line], m, (), int),
                 anchor=_filled(seen.anchor, m, (2,)),
@@ -366,8 +366,8 @@ _jit_middles = jax.jit(jax.vmap(middle_of))
 
 
 @partial(jax.jit, static_argnames=STATIC)
-def _jit_sightings(scans: Scan, poses: Pose, numbers: Array, lines: Lines, **options: Any) -> Sightings:
-    def of_scan(x: tuple[Scan, Pose, Array]) -> Sightings:
+def _jit_sightings(scans: Scan, poses: Pose, numbers: Array, lines: Lines, **options: Any) -> LineSightings:
+    def of_scan(x: tuple[Scan, Pose, Array]) -> LineSightings:
         return sightings_of_scan(*x[:2], lines, x[2], **options)
 
     return jax.lax.map(of_scan, (scans, poses, numbers))

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from linemap_jax.core.estimation.adjustment import Sightings, adjust, residual_of_sighting
+from linemap_jax.core.estimation.adjustment import LineSightings, adjust, residual_of_sighting
 from linemap_jax.core.estimation.loops import LoopSettings, close_loop
 from linemap_jax.core.estimation.pose_graph import Closures, PoseGraph, cov_of_registration, optimise
 from linemap_jax.core.estimation.registration import nearest, register
@@ -249,7 +249,7 @@ def test_poses_and_lines_adjusted_together() -> None:
             "valid": lines.valid.at[:3].set(True),
         }
     )
-    sightings = Sightings(
+    sightings = LineSightings(
         keyframe=jnp.asarray([s[0] for s in noisy] + [0]),
         line=jnp.asarray([s[1] for s in noisy] + [3]),
         anchor=jnp.asarray([s[2] for s in noisy] + [np.zeros(2)]),

@@ -32,7 +32,7 @@ _HELD = 1e12  # information on what is not moved
 
 
 @pytree
-class Sightings:
+class LineSightings:
     """Lines of the map, each as a keyframe has seen it, in the frame of the scanner."""
 
     keyframe: Int[Array, " O"]
@@ -62,7 +62,7 @@ def sightings_of_scan(
     thresholds: Thresholds,
     noise: SensorNoise,
     **options: Any,
-) -> Sightings:
+) -> LineSightings:
     """The lines of the map that a keyframe has seen, as many as the capacity of a scan, padded.
 
     Args:
@@ -80,7 +80,7 @@ def sightings_of_scan(
     foot = found.lines.anchor + found.lines.offset[:, None] * found.lines.normal - pose.mean[None, :2]
     turn = jnp.where(reverse, jnp.pi, 0).astype(foot.dtype) - pose.mean[2]
     sign = jnp.where(reverse, -1, 1).astype(foot.dtype)
-    return Sightings(
+    return LineSightings(
         keyframe=jnp.broadcast_to(keyframe, slot.shape),
         line=slot,
         anchor=jax.vmap(lambda at: rotate(-pose.mean[2], at))(foot),
@@ -107,7 +107,7 @@ def residual_of_sighting(
     return jnp.stack([offset, wrap_angle(line[1] - pose[2] - angle)])
 
 
-def adjust(graph: PoseGraph, lines: Lines, sightings: Sightings) -> Adjusted:
+def adjust(graph: PoseGraph, lines: Lines, sightings: LineSightings) -> Adjusted:
     """Poses and lines from steps and sightings.
 
     The lines are eliminated; what is left is dense, of order 3 N, and time grows with its cube. Sightings that do not

@@ -75,7 +75,7 @@ has it searched for."""
 
 
 @pytree
-class Tracking:
+class LocalizationSettings:
     """Where the filter draws its lines. Traced numbers, in metres and radians."""
 
     match_nis: Number = 9.21
@@ -133,7 +133,7 @@ class Belief:
     mean: Float[Array, "3"]  # x, y, theta; m, m, rad
     cov_own: Float[Array, "3 3"]  # of the part that is independent of the map's errors
     by_map: Float[Array, "3 M 2"]  # how the map's errors have moved the pose, each in units of its sigma
-    fit: Float[Array, ""]  # average over the latest scans, see `Tracking.least_fit`
+    fit: Float[Array, ""]  # average over the latest scans, see `LocalizationSettings.least_fit`
     lost: Bool[Array, ""]
 
     @property
@@ -213,7 +213,7 @@ def localize(
     thresholds: Thresholds | None = None,
     noise: SensorNoise | None = None,
     mount: Mount | None = None,
-    tracking: Tracking | None = None,
+    settings: LocalizationSettings | None = None,
     **options: Any,
 ) -> tuple[Belief, Located]:
     """The poses of a stack of scans, one after the other.
@@ -231,14 +231,14 @@ def localize(
       thresholds: of extraction and matching.
       noise: of the sensor.
       mount: of the scanner on the robot.
-      tracking: thresholds of the filter.
+      settings: thresholds of the filter.
       **options: `capacity`, `rules`, `segmentation`, `max_vertices`, `jacobians`, `covariance`, of `extract`.
 
     Returns:
       The belief after the last scan, and what the filter says after each, stacked `[T]`.
     """
     odometry, thresholds, noise = odometry or OdometryNoise(), thresholds or Thresholds(), noise or SensorNoise()
-    mount, tracking = mount or Mount(), tracking or Tracking()
+    mount, settings = mount or Mount(), settings or LocalizationSettings()
     rules = options.get("rules", Rules())
     lines = directed(line_map.lines)
 
@@ -248,7 +248,7 @@ def localize(
         expected = predict(belief, jnp.where(finite, move, 0), more, odometry)
         seen = observe(scan, mount, thresholds=thresholds, noise=noise, **options)
         moved = jnp.where(finite, jnp.sqrt(dot(move[:2], move[:2])), 0)
-        after, located = locate(expected, seen, moved, line_map, lines, field, thresholds, rules, noise, tracking)
+        after, located = locate(expected, seen, moved, line_map, lines, field, thresholds, rules, noise, settings)
         status = located.status | jnp.where(finite, 0, int(Status.POSE_NOT_FINITE))
         after = jax.tree.map(lambda a, b: jnp.where(is_active, a, b), after, belief)
         return after, dataclasses.replace(located, status=status)
@@ -318,7 +318,7 @@ def locate(
     thresholds: Thresholds,
     rules: Rules,
     noise: SensorNoise,
-    tracking: Tracking,
+    settings: LocalizationSettings,
 ) -> tuple[Belief, Located]:
     """The belief after a scan.
 
@@ -332,15 +332,15 @@ def locate(
       thresholds: `match_...`.
       rules: which reading of the method.
       noise: of the sensor.
-      tracking: thresholds of the filter.
+      settings: thresholds of the filter.
     """
     dtype = belief.mean.dtype
     cov = belief.cov
-    found = _found(belief, seen, moved, field, tracking)
-    resolution = _diagonal(tracking.search_position, tracking.search_heading, dtype)
+    found = _found(belief, seen, moved, field, settings)
+    resolution = _diagonal(settings.search_position, settings.search_heading, dtype)
     off = _minus(found, belief.mean)
     surprise = quadratic(off, inverse(cov + resolution))
-    wrong = jnp.where(surprise > tracking.surprise, surprise / 3 - 1, 0)
+    wrong = jnp.where(surprise > settings.surprise, surprise / 3 - 1, 0)
     prior = dataclasses.replace(belief, cov_own=belief.cov_own + wrong * (cov + resolution))
     vague = jnp.any(jnp.diag(prior.cov) > jnp.diag(resolution))
     # What is matched is judged by what the search leaves open, or by the prediction where that is surer.
@@ -353,27 +353,27 @@ def locate(
     def look(i: Array, carry: tuple[Array, Belief, Sightings, Array]) -> tuple[Array, Belief, Sightings, Array]:
         at, judged_by, *_ = carry
         spread = judged_by.cov
-        by_lines = sight_lines(seen, at, spread, lines, thresholds, rules, tracking)
-        by_circles = sight_circles(seen, at, spread, line_map.circles, lines.valid.shape[0], tracking)
+        by_lines = sight_lines(seen, at, spread, lines, thresholds, rules, settings)
+        by_circles = sight_circles(seen, at, spread, line_map.circles, lines.valid.shape[0], settings)
         by_points = jax.lax.cond(i > 0, points_from, lambda _: no_points, at)
-        sightings = gated(judged_by, _packed([by_lines, by_circles, by_points]), tracking.match_nis)
+        sightings = gated(judged_by, _packed([by_lines, by_circles, by_points]), settings.match_nis)
         after, nis = update(prior, at, sightings)
         return after.mean, after, sightings, nis
 
     def points_from(at: Float[Array, "3"]) -> Sightings:
-        return sight_points(seen, at, seen.alone, lines, noise, tracking)
+        return sight_points(seen, at, seen.alone, lines, noise, settings)
 
     no_points = _no_sightings(min(GROUPS, lines.valid.shape[0]), dtype)
     start = jnp.where(vague, found, belief.mean)
     carry = (start, judged_by, _no_sightings(SIGHTINGS, dtype), jnp.zeros((), dtype))
     _, after, sightings, nis = jax.lax.fori_loop(0, ITERATIONS, look, carry)
 
-    fit = fit_of_scan(seen, after.mean, lines, field, tracking)
-    used = (fit >= tracking.least_fit) & (fit >= tracking.sudden * belief.fit)
-    average = tracking.memory * belief.fit + (1 - tracking.memory) * fit
-    lost = average < jnp.where(belief.lost, tracking.found_fit, tracking.least_fit)
+    fit = fit_of_scan(seen, after.mean, lines, field, settings)
+    used = (fit >= settings.least_fit) & (fit >= settings.sudden * belief.fit)
+    average = settings.memory * belief.fit + (1 - settings.memory) * fit
+    lost = average < jnp.where(belief.lost, settings.found_fit, settings.least_fit)
     after = jax.tree.map(lambda a, b: jnp.where(used, a, b), after, belief)
-    after = dataclasses.replace(_less_sure(after, used, lost, field, tracking), fit=average, lost=lost)
+    after = dataclasses.replace(_less_sure(after, used, lost, field, settings), fit=average, lost=lost)
     count = lines.valid.shape[0]
 
     def used_of(which: Bool[Array, " S"]) -> Int[Array, ""]:
@@ -392,7 +392,7 @@ def locate(
 
 
 def _found(
-    belief: Belief, seen: Seen, moved: Float[Array, ""], field: LikelihoodField, tracking: Tracking
+    belief: Belief, seen: Seen, moved: Float[Array, ""], field: LikelihoodField, settings: LocalizationSettings
 ) -> Float[Array, "3"]:
     """Where to look: the pose near the prediction that explains the scan best; farther away if none near does."""
     dtype = belief.mean.dtype
@@ -404,18 +404,18 @@ def _found(
 
     def explained(pose: Float[Array, "3"]) -> Float[Array, ""]:
         turned = jax.vmap(lambda p: rotate(pose[2], p))(points) + pose[None, :2]
-        near = valid & (distances(field, turned) < tracking.explained_distance)
+        near = valid & (distances(field, turned) < settings.explained_distance)
         return jnp.sum(near) / jnp.maximum(jnp.sum(valid), 1)
 
     # Wheels may slip altogether, or run backwards and be counted forwards.
-    slip = jnp.sqrt(tracking.slip_position**2 + jnp.minimum(moved, tracking.slip_step) ** 2)
-    near = around(slip, tracking.slip_heading, NEARBY)
+    slip = jnp.sqrt(settings.slip_position**2 + jnp.minimum(moved, settings.slip_step) ** 2)
+    near = around(slip, settings.slip_heading, NEARBY)
     of_near = explained(near)
-    enough = tracking.least_fit + CLEARLY
-    astray = (of_near < enough) & (tracking.memory * belief.fit + (1 - tracking.memory) * of_near < enough)
+    enough = settings.least_fit + CLEARLY
+    astray = (of_near < enough) & (settings.memory * belief.fit + (1 - settings.memory) * of_near < enough)
 
     def farther() -> Float[Array, "3"]:
-        far = around(tracking.astray_position, tracking.astray_heading, FARTHER)
+        far = around(settings.astray_position, settings.astray_heading, FARTHER)
         return jnp.where(explained(far) > of_near + CLEARLY, far, near)
 
     return jax.lax.cond(astray, farther, lambda: near)
@@ -428,7 +428,7 @@ def sight_lines(
     model: Lines,
     thresholds: Thresholds,
     rules: Rules,
-    tracking: Tracking,
+    settings: LocalizationSettings,
 ) -> Sightings:
     """The lines of a scan, each held against the line of the map that it is: the gates of the map builder.
 
@@ -439,14 +439,14 @@ def sight_lines(
       model: the lines of the map.
       thresholds: `match_...`.
       rules: which reading of the method.
-      tracking: the floors.
+      settings: the floors.
     """
     new, jac = place(seen.lines, pose, cov)
     matches = match_lines(new, model, seen.collinear, thresholds, rules, "independent")
     mine = take(model, jnp.maximum(matches.slot, 0))
     pair: Any = jax.vmap(lambda a, b: compare_lines(a, b, thresholds, "independent"))(new, mine)
     sign = jnp.stack([pair.sign, jnp.ones_like(pair.sign)], -1)
-    floor = jnp.stack([jnp.asarray(tracking.offset_floor), jnp.asarray(tracking.angle_floor)]) ** 2
+    floor = jnp.stack([jnp.asarray(settings.offset_floor), jnp.asarray(settings.angle_floor)]) ** 2
     return _where(
         matches.slot >= 0,
         slot=matches.slot,
@@ -490,7 +490,12 @@ def jac_line_pose(lines: Lines, lever: Float[Array, "K 2"]) -> Float[Array, "K 2
 
 
 def sight_circles(
-    seen: Seen, pose: Float[Array, "3"], cov: Float[Array, "3 3"], model: Circles, first: int, tracking: Tracking
+    seen: Seen,
+    pose: Float[Array, "3"],
+    cov: Float[Array, "3 3"],
+    model: Circles,
+    first: int,
+    settings: LocalizationSettings,
 ) -> Sightings:
     """The fitted circles of a scan as points, each held against the nearest fitted one of the map, in sigmas.
 
@@ -503,14 +508,14 @@ def sight_circles(
     jac = jnp.concatenate([eye, perp(lever)[:, :, None]], -1)
     ahead = unit(pose[2])
     turn = jnp.broadcast_to(jnp.stack([ahead, perp(ahead)], -1), eye.shape)
-    mine = propagate(turn, circles.cov[:, :2, :2]) + tracking.offset_floor**2 * eye
+    mine = propagate(turn, circles.cov[:, :2, :2]) + settings.offset_floor**2 * eye
     change = (pose[None, :2] + lever)[:, None] - model.center[None]
     total = (mine + propagate(jac, cov))[:, None] + model.cov[None, :, :2, :2]
     alike = (circles.valid & circles.fitted)[:, None] & (model.valid & model.fitted)[None]
     total = jnp.where(alike[..., None, None], total, jnp.eye(2, dtype=lever.dtype))
     slot, best = least(jnp.where(alike, quadratic(change, inverse(total)), jnp.inf))
     return _where(
-        best < tracking.match_nis,
+        best < settings.match_nis,
         slot=first + slot,
         innovation=jnp.take_along_axis(change, slot[:, None, None], 1)[:, 0],
         jac_pose=jac,
@@ -520,7 +525,12 @@ def sight_circles(
 
 
 def sight_points(
-    seen: Seen, pose: Float[Array, "3"], which: Bool[Array, " N"], model: Lines, noise: SensorNoise, tracking: Tracking
+    seen: Seen,
+    pose: Float[Array, "3"],
+    which: Bool[Array, " N"],
+    model: Lines,
+    noise: SensorNoise,
+    settings: LocalizationSettings,
 ) -> Sightings:
     """Points in no line, each held against the nearest segment of the map; those at one segment make one sighting.
 
@@ -533,7 +543,7 @@ def sight_points(
       which: the points that take part. Shape `[N]`.
       model: the lines of the map.
       noise: of the sensor.
-      tracking: `point_distance` and the floors.
+      settings: `point_distance` and the floors.
     """
     towards = jax.vmap(lambda a: rotate(pose[2], a))(seen.beams)
     points = pose[None, :2] + jax.vmap(lambda a: rotate(pose[2], a))(seen.points)
@@ -542,8 +552,8 @@ def sight_points(
     across, along, beside = (jnp.take_along_axis(x, slot[:, None], 1)[:, 0] for x in (across, along, beside))
     cosine = dot(model.normal[slot], towards)
     variance = (noise.range_sigma * cosine) ** 2 + (noise.bearing_sigma * seen.ranges) ** 2 * (1 - cosine**2)
-    variance = variance + tracking.offset_floor**2
-    used = which & (jnp.abs(across) < tracking.point_distance) & (beside < tracking.offset_floor)
+    variance = variance + settings.offset_floor**2
+    used = which & (jnp.abs(across) < settings.point_distance) & (beside < settings.offset_floor)
     used = used & (jnp.abs(cosine) > GRAZING)
     weight = jnp.where(used, 1 / variance, 0)
 
@@ -565,8 +575,8 @@ def sight_points(
     mine = take(model, index)
     lever = mine.point_at(middle[index]) - pose[None, :2]
     zero = jnp.zeros_like(information)
-    var_offset = 1 / safe[index] + tracking.offset_floor**2
-    var_angle = 1 / spread[index] + tracking.angle_floor**2
+    var_offset = 1 / safe[index] + settings.offset_floor**2
+    var_angle = 1 / spread[index] + settings.angle_floor**2
     return _where(
         information > 0,
         slot=index,
@@ -680,7 +690,7 @@ def _inverse_root(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 
 def fit_of_scan(
-    seen: Seen, pose: Float[Array, "3"], lines: Lines, field: LikelihoodField, tracking: Tracking
+    seen: Seen, pose: Float[Array, "3"], lines: Lines, field: LikelihoodField, settings: LocalizationSettings
 ) -> Float[Array, ""]:
     """How well the map explains a scan: the share of returns near something of it, less that of returns behind a wall.
 
@@ -692,7 +702,7 @@ def fit_of_scan(
     beams, _ = thinned(seen.beams, seen.returned)
     points = pose[None, :2] + jax.vmap(lambda a: rotate(pose[2], a))(points)
     beams = jax.vmap(lambda a: rotate(pose[2], a))(beams)
-    explained = valid & (distances(field, points) < tracking.explained_distance)
+    explained = valid & (distances(field, points) < settings.explained_distance)
 
     back = (pose[:2] + rotate(pose[2], seen.laser))[None] - lines.anchor
     height = lines.offset - dot(lines.normal, back)
@@ -700,9 +710,9 @@ def fit_of_scan(
     meets = jnp.abs(slope) > GRAZING
     reach = height[None] / jnp.where(meets, slope, 1)
     along = dot(lines.tangent, back)[None] + reach * dot(lines.tangent[None], beams[:, None])
-    margin = tracking.explained_distance
+    margin = settings.explained_distance
     inside = (along > lines.extent[None, :, 0] + margin) & (along < lines.extent[None, :, 1] - margin)
-    behind = meets & (reach > 0) & (reach < ranges - tracking.through_distance)
+    behind = meets & (reach > 0) & (reach < ranges - settings.through_distance)
     often = lines.valid & (lines.times_detected >= OFTEN)
     through = valid & ~explained & jnp.any(inside & behind & often[None], -1)
     count = jnp.maximum(jnp.sum(valid), 1).astype(pose.dtype)
@@ -711,15 +721,15 @@ def fit_of_scan(
 
 
 def _less_sure(
-    belief: Belief, used: Bool[Array, ""], lost: Bool[Array, ""], field: LikelihoodField, tracking: Tracking
+    belief: Belief, used: Bool[Array, ""], lost: Bool[Array, ""], field: LikelihoodField, settings: LocalizationSettings
 ) -> Belief:
     """The belief after a scan that the map does not explain: the wheels may have slipped unseen.
 
     Of a robot that is lost: it may have gone anywhere, but is not likely to have left the map.
     """
     dtype = belief.mean.dtype
-    slipped = _diagonal(tracking.slip_position, tracking.slip_heading, dtype)
-    more = jnp.where(lost, _diagonal(tracking.lost_position, tracking.lost_heading, dtype), slipped)
+    slipped = _diagonal(settings.slip_position, settings.slip_heading, dtype)
+    more = jnp.where(lost, _diagonal(settings.lost_position, settings.lost_heading, dtype), slipped)
     most = jnp.stack([field.cell * field.distance.shape[0] / 2] * 2 + [jnp.asarray(np.pi, dtype)]) ** 2
     room = jnp.diag(belief.cov) < most
     return dataclasses.replace(belief, cov_own=belief.cov_own + jnp.where(used, 0, more * room[None]))
