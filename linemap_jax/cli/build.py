@@ -50,6 +50,9 @@ class Build(LogOptions):
     def run(self) -> int:
         """Build the map, and give the exit status."""
         options: dict[str, Any] = options_of_update(self) | {"pose_error": self.pose_error}
+        import jax
+        import numpy as np
+
         from linemap_jax.core.state import Status
         from linemap_jax.io.map_file import write_map
         from linemap_jax.io.plot import plot_map
@@ -84,6 +87,8 @@ class Build(LogOptions):
                 quiet=self.quiet,
             )
 
+        # On the host, where nothing has to be compiled.
+        line_map = jax.tree.map(np.asarray, line_map)
         if not line_map.lines.valid.any() and not line_map.circles.valid.any():
             say(f"warning: {log.path}: {_rejections(self, log, options)}", quiet=self.quiet)
         make_folder(self.output)
@@ -168,16 +173,16 @@ def _summary(
     chunks = ((chunk.scans, chunk.poses) for chunk in chunks_of_log(seldom, log, CHUNK))
     share = explained_share(line_map, chunks, options["mount"], chunk=CHUNK)
     lines = line_map.lines
-    length = np.asarray(lines.length)[np.asarray(lines.valid)]
+    length = lines.length[lines.valid]
     return {
         "log": str(command.log),
         "preset": command.preset,
         "scans": scans,
-        "lines": int(np.asarray(lines.valid).sum()),
-        "circles": int(np.asarray(line_map.circles.valid).sum()),
+        "lines": int(lines.valid.sum()),
+        "circles": int(line_map.circles.valid.sum()),
         "explained": share,
         "median_line_length_m": float(np.median(length)) if length.size else 0.0,
-        "duplicates": int(duplicates(lines).sum()),
+        "duplicates": int(np.asarray(duplicates(lines)).sum()),
         # The first piece holds the compilation: a log of one piece does not tell.
         "us_per_scan": 1e6 * float(np.median([t / count for t, count in seconds[1:]])) if len(seconds) > 1 else None,
         "seconds_to_first_chunk": seconds[0][0],

@@ -56,7 +56,8 @@ def kept_program(
             file = folder / name
             program = _read(file)
             if program is not None:
-                _load_lapack()
+                if b"lapack" in program.mlir_module_serialized:
+                    _load_lapack()
             else:
                 program = export.export(jitted)(*args, **kwargs)
                 _write(file, program)
