@@ -5,7 +5,11 @@ from typing import Any
 
 import jax
 
-AS_USERS: Any = {"xla_backend_optimization_level": 3, "xla_cpu_use_fusion_emitters": True}
+AS_USERS: Any = {
+    "xla_backend_optimization_level": 3,
+    "xla_cpu_use_fusion_emitters": True,
+    "xla_cpu_parallel_codegen_split_count": 32,
+}
 """As jax does it unless told otherwise."""
 AS_BUILD: Any = AS_USERS | {"xla_cpu_use_fusion_emitters": False}
 """As `linemap_jax.build` does it."""
