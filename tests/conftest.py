@@ -43,12 +43,15 @@ def pytest_collection_finish() -> None:
 
 
 LONGEST = (
-    "test_oracle",
     "test_notebooks",
-    "test_consistency",
+    "test_oracle",
     "test_cli",
-    "test_cli_slam",
     "test_gradients",
+    "test_cli_lab",
+    "test_consistency",
+    "test_verification",
+    "test_batch",
+    "test_cli_slam",
     "test_trials",
     "test_readme",
 )
