@@ -5,11 +5,7 @@ from typing import Any
 
 import jax
 
-AS_USERS: Any = {
-    "xla_backend_optimization_level": 3,
-    "xla_cpu_use_fusion_emitters": True,
-    "xla_cpu_parallel_codegen_split_count": 32,
-}
+AS_USERS: Any = {"xla_backend_optimization_level": 3, "xla_cpu_use_fusion_emitters": True}
 """As jax does it unless told otherwise."""
 AS_BUILD: Any = AS_USERS | {"xla_cpu_use_fusion_emitters": False}
 """As `linemap_jax.build` does it."""
