@@ -1,5 +1,6 @@
 """How the tests run: on the CPU, in float64 unless a test says otherwise, every annotated shape checked at run time."""
 
+import gc
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -30,13 +31,27 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 
+# To trace a program makes very many objects, and hardly any cycles among them. As often as Python looks for those by
+# default, that takes a tenth of all time, and more the more programs are kept.
+gc.set_threshold(100_000, 20, 100)
+
+
+def pytest_collection_finish() -> None:
+    """What is loaded by now stays: nobody need look through it again."""
+    gc.collect()
+    gc.freeze()
+
+
 LONGEST = (
-    "test_oracle",
     "test_notebooks",
-    "test_consistency",
+    "test_oracle",
     "test_cli",
-    "test_cli_slam",
     "test_gradients",
+    "test_cli_lab",
+    "test_consistency",
+    "test_verification",
+    "test_batch",
+    "test_cli_slam",
     "test_trials",
     "test_readme",
 )

@@ -20,9 +20,9 @@ from linemap_jax.cli.build import Build
 from linemap_jax.cli.extract import Extract
 from linemap_jax.io.config import read_config
 
-BEAMS = 181  # one number in the whole file: each other number would be compiled anew
+BEAMS = 361  # as many as in the log of the demo, and one number in the whole file: each other would be compiled anew
 SCANS = 10
-BEARINGS = np.deg2rad(np.arange(BEAMS) - 90.0)
+BEARINGS = np.deg2rad(np.arange(BEAMS) / 2 - 90.0)
 WEST, SOUTH, EAST, NORTH = -2.0, -3.0, 6.0, 3.0  # m: a room
 POLE = np.array([3.0, 1.0, 0.13])  # m: x, y, radius
 
@@ -347,7 +347,7 @@ def test_readings_that_are_no_returns_change_nothing_else(run, write, tmp_path):
 
 EMPTY_SCANS = {
     "no return": np.full(BEAMS, 81.83),
-    "one return": np.where(np.arange(BEAMS) == 90, 2.0, 81.83),
+    "one return": np.where(np.arange(BEAMS) == 180, 2.0, 81.83),
     "all at the scanner": np.full(BEAMS, 0.0),
     "all points nearly equal": np.full(BEAMS, 0.001),
 }
@@ -362,7 +362,9 @@ def test_scans_that_hold_nothing(run, write, tmp_path, kind):
     assert document["lines"] == []
     assert len(document["circles"]) <= 1
     if not document["circles"]:
-        said = re.fullmatch(r"linemap: warning: \S+: nothing was found in 543 beams: (\d+) gave no return.*\n", err)
+        said = re.fullmatch(
+            rf"linemap: warning: \S+: nothing was found in {3 * BEAMS} beams: (\d+) gave no return.*\n", err
+        )
         assert said is not None, err
         assert int(said[1]) == 3 * np.sum(~((EMPTY_SCANS[kind] > 0) & (EMPTY_SCANS[kind] < 50)))
         assert run("extract", path, "-o", tmp_path / "again.jsonl")[2].startswith(err)
@@ -625,7 +627,7 @@ def bag_of(drive: list[str], *, cov: Any = None) -> Recording:
         fields = [float(field) for field in line.split()[1:-2]]
         ranges, (x, y, theta), stamp = fields[1 : 1 + BEAMS], fields[1 + BEAMS : 4 + BEAMS], fields[-1]
         recording.odometry(stamp, (x, y, theta), cov=cov)
-        recording.scan(stamp, ranges, angle_min=-np.pi / 2, angle_increment=np.deg2rad(1.0), range_max=50.0)
+        recording.scan(stamp, ranges, angle_min=-np.pi / 2, angle_increment=np.deg2rad(0.5), range_max=50.0)
     return recording
 
 
@@ -666,7 +668,7 @@ def test_info_of_a_carmen_log(run, log):
     told = json.loads(out)
     assert (told["format"], told["scans"], told["beams"], told["rate_hz"]) == ("CARMEN log", SCANS, BEAMS, 1.0)
     assert told["messages"] == [{"name": "FLASER", "type": None, "count": SCANS}]
-    np.testing.assert_allclose(told["bearings_rad"], [-np.pi / 2, np.pi / 180, np.pi / 2])
+    np.testing.assert_allclose(told["bearings_rad"], [-np.pi / 2, np.pi / (BEAMS - 1), np.pi / 2])
     assert told["shares"]["returns"] > 0.99
     assert sum(told["shares"].values()) == pytest.approx(1)
     words = f"{log}: CARMEN log\n        10 FLASER\nscans:    10 in 9.0 s, 1.0 a second\n"

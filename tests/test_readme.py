@@ -36,8 +36,10 @@ def test_the_python_runs_as_a_user_would_run_it(tmp_path):
     assert "build_chunks" in code
     demo = resources.files("linemap_jax.io").joinpath("data", "demo.log.gz")
     (tmp_path / "my.log.gz").write_bytes(demo.read_bytes())
+    # Of the cache see [tool.pytest.ini_options] in pyproject.toml.
+    warnings = "-W", "error", "-W", "ignore:Error reading persistent compilation cache entry:UserWarning"
     done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
+        [sys.executable, *warnings, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
     said = re.match(r"\[(\S+)\] \[(\S+)\]\n1 \[\[", done.stdout)

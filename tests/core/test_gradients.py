@@ -69,13 +69,16 @@ def of_extraction(
     return moments(found)
 
 
-def of_map(steps: jax.Array, given: tuple[Any, ...], scan: Scan, line_map: LineMap, name: str) -> jax.Array:
-    """After a step of each input, all of its numbers alike."""
+def of_map(
+    steps: jax.Array, given: tuple[Any, ...], scan: Scan, line_map: LineMap, name: str
+) -> tuple[jax.Array, LineMap]:
+    """After a step of each input, all of its numbers alike; and the map itself."""
     given = [jax.tree.map(lambda x, step=step: x + step, x) for x, step in zip(given, steps, strict=True)]
     ranges, pose, noise, mount, thresholds = given
     options = preset(name) | {"thresholds": thresholds, "noise": noise, "mount": mount, "capacity": SCAN}
     scan = dataclasses.replace(scan, ranges=ranges)
-    return moments(update(line_map, scan, pose, jacobians="analytic", **options)[0])
+    line_map, _ = update(line_map, scan, pose, jacobians="analytic", **options)
+    return moments(line_map), line_map
 
 
 def assert_finite(gradient: Any) -> None:
@@ -103,17 +106,20 @@ def test_gradients_of_an_extraction_are_finite(name: str, jacobians: str) -> Non
 def test_gradients_of_a_map_are_finite(name: str) -> None:
     """In forward mode: wiping loops over as many lines as are cut, which has no reverse."""
     # Not optimised at all, XLA (jax 0.8.3) reads one number of this program twice, and the second time as NaN.
-    gradient = jax.jit(jax.jacfwd(of_map), static_argnames="name", compiler_options=A_LITTLE)
+    gradient = jax.jit(jax.jacfwd(of_map, has_aux=True), static_argnames="name", compiler_options=A_LITTLE)
     full = scans()["room"]
-    step = jax.jit(partial(update, capacity=SCAN, **preset(name)))
     # The map of another view, so that lines and circles are fused, added and wiped
     other = Pose(mean=jnp.array([0.12, -0.22, 0.06]), cov=jnp.asarray(COV_POSE))
     moved = np.where((np.arange(N) > 60) & (np.arange(N) < 70), 0.5 * full, full)
-    line_map, _ = step(empty_map(MAP), Scan.from_ranges(moved, BEARINGS), other)
+    ranges, _, noise, *_ = inputs(moved, COV_POSE)
+    mount, thresholds = jax.tree.map(lambda x: jnp.asarray(x, float), (Mount(), preset(name)["thresholds"]))
+    given = ranges, other, noise, mount, thresholds
+    found, line_map = gradient(jnp.zeros(5), given, Scan.from_ranges(moved, BEARINGS), empty_map(MAP), name=name)
+    assert np.isfinite(found).all()
     assert line_map.lines.valid.sum() > 2
     for ranges in scans().values():
         scan = Scan.from_ranges(ranges, BEARINGS)
         for before in (line_map, empty_map(MAP)):
-            found = gradient(jnp.zeros(5), inputs(ranges, COV_POSE), scan, before, name=name)
+            found, _ = gradient(jnp.zeros(5), inputs(ranges, COV_POSE), scan, before, name=name)
             assert np.isfinite(found).all()
             assert (found[0] != 0) == (np.isfinite(ranges).sum() > 2)

@@ -7,8 +7,8 @@ import os
 import sys
 
 output, devices, *host = sys.argv[1:]
-# Without other flags: compiled with no optimisation, programs for one device and for several round differently.
-os.environ["XLA_FLAGS"] = f"--xla_force_host_platform_device_count={devices}"
+# Without those of the tests: compiled with no optimisation, programs for one device and for several round differently.
+os.environ["XLA_FLAGS"] = f"--xla_force_host_platform_device_count={devices} --xla_cpu_use_fusion_emitters=false"
 
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
