@@ -37,11 +37,16 @@ from pathlib import Path
 from typing import Any, Literal
 
 CORES = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [0]
+ALL_CORES = "--all-cores"
+"""Given to the process that measures the rows with several devices. Threads of jax that share one core would wait for
+each other: a process is on one core, or on all, before jax counts them."""
+if ALL_CORES not in sys.argv and hasattr(os, "sched_setaffinity"):
+    os.sched_setaffinity(0, CORES[:1])
 
 import jax  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
-jax.config.update("jax_num_cpu_devices", len(CORES))
+jax.config.update("jax_num_cpu_devices", len(CORES) if ALL_CORES in sys.argv else 1)
 
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
@@ -79,7 +84,14 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true", help="four rows, within a minute")
     parser.add_argument("--json", type=Path, help="write the rows to this file")
     parser.add_argument("--write", action="store_true", help="write the table into README")
+    parser.add_argument(ALL_CORES, nargs=3, metavar=("DTYPE", "PRESET", "CORES"), help=argparse.SUPPRESS)
     options = parser.parse_args()
+    if options.all_cores:
+        dtype, choice, count = options.all_cores
+        scans = still_scans()
+        assert scans is not None, "asked for where real scans are there"
+        print(json.dumps(extraction(scans, 4096, dtype, choice, devices=int(count))))
+        return 0
     with tempfile.TemporaryDirectory() as folder:
         jax.config.update("jax_compilation_cache_dir", folder)
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
@@ -112,8 +124,7 @@ def measure(quick: bool, cpp: "Cpp | None") -> Any:
                     row = extraction(scans, batch, dtype, choice, quick=quick) | {"scans": kind}
                     yield told(row, cpp_stills[kind], numpy)
                 if not quick and len(CORES) > 1 and kind == "real":
-                    row = extraction(scans, 4096, dtype, choice, devices=len(CORES)) | {"scans": kind}
-                    yield told(row, cpp_stills[kind], numpy)
+                    yield told(on_all_cores(dtype, choice) | {"scans": kind}, cpp_stills[kind], numpy)
     for dtype in ("float32",) if quick else ("float32", "float64"):
         for capacity in (128,) if quick else (64, 128, 256, 512, 1024, 2048):
             yield told(map_step(drive, capacity, dtype, quick=quick) | {"scans": "simulated"}, cpp_drive)
@@ -141,7 +152,16 @@ def extraction(scans: Scan, batch: int, dtype: str, choice: Preset, devices: int
         run = jax.shard_map(several, mesh=mesh, in_specs=split, out_specs=split, check_vma=False)
         given = jax.device_put(some, NamedSharding(mesh, split))
     row = {"name": "extract", "preset": choice, "batch": batch, "dtype": dtype, "devices": devices, "capacity": None}
-    return row | timed(run, given, scans=batch, cores=devices, quick=quick)
+    return row | timed(run, given, scans=batch, quick=quick)
+
+
+def on_all_cores(dtype: str, choice: Preset) -> Row:
+    """A row of `extract` with as many devices as there are cores, from a process of its own."""
+    command = [sys.executable, __file__, ALL_CORES, dtype, choice, str(len(CORES))]
+    said = subprocess.run(
+        command, check=True, capture_output=True, text=True, preexec_fn=lambda: os.sched_setaffinity(0, CORES)
+    )
+    return json.loads(said.stdout)
 
 
 def map_step(drive: tuple[Scan, Pose], capacity: int, dtype: str, *, quick: bool) -> Row:
@@ -197,26 +217,25 @@ def scan_to_map(log: tuple[Scan, Pose], dtype: str, choice: Preset, *, quick: bo
     return row | timed(several, *given, scans=count, options=COMPILER_OPTIONS, quick=quick)
 
 
-def timed(
-    function: Callable[..., Any], *given: Any, scans: int, cores: int = 1, options: Any = None, quick: bool = False
-) -> Row:
+def timed(function: Callable[..., Any], *given: Any, scans: int, options: Any = None, quick: bool = False) -> Row:
     """Compile, once more from the cache unless it has to be quick, and run for a second or so."""
 
-    def compiled_in() -> tuple[Callable[..., Any], float]:
+    # Called as users call it: what `compile` gives has no quick way from Python.
+    jitted = jax.jit(function, compiler_options=options)
+
+    def compiled_in() -> float:
         jax.clear_caches()
         begin = time.perf_counter()
-        compiled = jax.jit(function, compiler_options=options).lower(*given).compile()
-        return compiled, time.perf_counter() - begin
+        jitted.lower(*given).compile()
+        return time.perf_counter() - begin
 
-    on_cores(len(CORES))
-    compiled, cold = compiled_in()
-    compiled, warm = (compiled, None) if quick else compiled_in()
-    on_cores(cores)
+    cold = compiled_in()
+    warm = None if quick else compiled_in()
     spans, used = [], []
-    jax.block_until_ready(compiled(*given))
+    jax.block_until_ready(jitted(*given))
     while len(spans) < 7 or (sum(spans) < 1.0 and len(spans) < 1000):
         begin, process = time.perf_counter(), time.process_time()
-        jax.block_until_ready(compiled(*given))
+        jax.block_until_ready(jitted(*given))
         spans.append(time.perf_counter() - begin)
         used.append(time.process_time() - process)
     low, median, high = (1e6 * x / scans for x in statistics.quantiles(spans, n=4))
@@ -236,13 +255,6 @@ def told(row: Row, cpp: Callable[[], float] | None, numpy: float | None = None) 
     row["ratio_to_numpy"] = row["us_per_scan"] / numpy if numpy else None
     print(json.dumps(row), file=sys.stderr, flush=True)
     return row
-
-
-def on_cores(count: int) -> None:
-    """All threads of the process on so many cores."""
-    if hasattr(os, "sched_setaffinity"):
-        for thread in os.listdir("/proc/self/task"):
-            os.sched_setaffinity(int(thread), CORES[:count])
 
 
 class Cpp:
@@ -276,7 +288,6 @@ class Cpp:
 
         def time_it() -> float:
             command = [self.program, file, "runs=15", "rep=20", "dl=0.05", "cov=1"]
-            on_cores(1)
             said = subprocess.run(command, check=True, capture_output=True, text=True).stdout
             return float(said.split("median=")[1].split()[0])
 
@@ -285,7 +296,6 @@ class Cpp:
 
 def numpy_extractor(scans: Scan, choice: Preset) -> float:
     """What the plain NumPy extractor takes a scan, us; the median of ten scans."""
-    on_cores(1)
     pose, options = pose_at("float64"), preset(choice)
     spans = []
     for i in range(0, 100, 10):

@@ -45,7 +45,8 @@ def extract(
 ) -> Extraction:
     """Lines and circles of one scan, in the frame of the world, with covariances.
 
-    `vmap` it for batches. The dtype is that of the scan.
+    `vmap` it for batches; on a CPU `jax.lax.map` is faster, which takes one scan after the other. The dtype is that of
+    the scan.
 
     Args:
       scan: `N` beams.
