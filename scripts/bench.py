@@ -40,8 +40,12 @@ CORES = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else
 ALL_CORES = "--all-cores"
 """Given to the process that measures the rows with several devices. Threads of jax that share one core would wait for
 each other: a process is on one core, or on all, before jax counts them."""
-if ALL_CORES not in sys.argv and hasattr(os, "sched_setaffinity"):
-    os.sched_setaffinity(0, CORES[:1])
+if hasattr(os, "sched_setaffinity"):
+    if ALL_CORES in sys.argv:  # begun by a process that is on one
+        CORES = [int(core) for core in sys.argv[-1].split(",")]
+        os.sched_setaffinity(0, CORES)
+    else:
+        os.sched_setaffinity(0, CORES[:1])
 
 import jax  # noqa: E402
 
@@ -87,10 +91,10 @@ def main() -> int:
     parser.add_argument(ALL_CORES, nargs=3, metavar=("DTYPE", "PRESET", "CORES"), help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.all_cores:
-        dtype, choice, count = options.all_cores
+        dtype, choice, _ = options.all_cores
         scans = still_scans()
         assert scans is not None, "asked for where real scans are there"
-        print(json.dumps(extraction(scans, 4096, dtype, choice, devices=int(count))))
+        print(json.dumps(extraction(scans, 4096, dtype, choice, devices=len(CORES))))
         return 0
     with tempfile.TemporaryDirectory() as folder:
         jax.config.update("jax_compilation_cache_dir", folder)
@@ -157,10 +161,8 @@ def extraction(scans: Scan, batch: int, dtype: str, choice: Preset, devices: int
 
 def on_all_cores(dtype: str, choice: Preset) -> Row:
     """A row of `extract` with as many devices as there are cores, from a process of its own."""
-    command = [sys.executable, __file__, ALL_CORES, dtype, choice, str(len(CORES))]
-    said = subprocess.run(
-        command, check=True, capture_output=True, text=True, preexec_fn=lambda: os.sched_setaffinity(0, CORES)
-    )
+    command = [sys.executable, __file__, ALL_CORES, dtype, choice, ",".join(map(str, CORES))]
+    said = subprocess.run(command, check=True, capture_output=True, text=True)
     return json.loads(said.stdout)
 
 
@@ -219,7 +221,6 @@ def scan_to_map(log: tuple[Scan, Pose], dtype: str, choice: Preset, *, quick: bo
 
 def timed(function: Callable[..., Any], *given: Any, scans: int, options: Any = None, quick: bool = False) -> Row:
     """Compile, once more from the cache unless it has to be quick, and run for a second or so."""
-
     # Called as users call it: what `compile` gives has no quick way from Python.
     jitted = jax.jit(function, compiler_options=options)
 
