@@ -233,9 +233,6 @@ def _fit_circles(
     worth = (clusters.of_point >= 0) & clusters.spread(solvable)
     count, room = jnp.sum(worth), -(-worth.shape[0] // FEW)
 
-    def none(circle: Array) -> _Fit:
-        return _Fit(circle, jnp.zeros((*circle.shape, 3), circle.dtype), jnp.zeros_like(circle[:, 0]))
-
     def few(circle: Array) -> _Fit:
         index, some = clusters.only(worth, room)
         return _most_likely(circle, z[index], points.beam[index], some, laser, noise)
@@ -244,7 +241,7 @@ def _fit_circles(
         return _most_likely(circle, z, points.beam, clusters, laser, noise)
 
     choice = largest_of_batch((count > 0).astype(jnp.int32) + (count > room).astype(jnp.int32))
-    fit: _Fit = jax.lax.switch(choice, [none, few, all_], circle)
+    fit: _Fit = jax.lax.switch(choice, [_no_fit, few, all_], circle)
     circle, cov, misfit = fit
 
     center, radius = circle[:, :2], circle[:, 2]
@@ -302,14 +299,19 @@ def _most_likely(
         cov = inverse(sums[:, jnp.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])])
         return cov, apply(cov, sums[:, 6:9]), sums[:, 9]
 
-    def step(_: Array, circle: Array) -> Array:
-        improved = circle + normal_equations(circle)[1]
-        sound = jnp.all(jnp.isfinite(improved), -1) & (improved[:, 2] > 0)
-        return jnp.where(sound[:, None], improved, circle)
+    def step(i: Array, fit: _Fit) -> _Fit:
+        cov, change, misfit = normal_equations(fit.circle)
+        improved = fit.circle + change
+        # The last step moves nothing: it says what the others have come to.
+        sound = (i < GAUSS_NEWTON_STEPS) & jnp.all(jnp.isfinite(improved), -1) & (improved[:, 2] > 0)
+        return _Fit(jnp.where(sound[:, None], improved, fit.circle), cov, misfit)
 
-    circle = jax.lax.fori_loop(0, GAUSS_NEWTON_STEPS, step, circle)
-    cov, _, misfit = normal_equations(circle)
-    return _Fit(circle, cov, misfit)
+    return jax.lax.fori_loop(0, GAUSS_NEWTON_STEPS + 1, step, _no_fit(circle))
+
+
+def _no_fit(circle: Float[Array, "K 3"]) -> _Fit:
+    """Circles as they are, of which nothing is known."""
+    return _Fit(circle, jnp.zeros((*circle.shape, 3), circle.dtype), jnp.zeros_like(circle[:, 0]))
 
 
 class _Beams(NamedTuple):

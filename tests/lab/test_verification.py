@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from readme import read_part
 
 from linemap_jax.cli import main
 from linemap_jax.core import lines
@@ -293,9 +294,9 @@ def test_citations_are_read(text: str, numbers: set[int]) -> None:
 
 def test_the_readme_holds_the_tables_that_the_code_makes(rows: dict[str, Row]) -> None:
     script = runpy.run_path(str(ROOT / "scripts/write_equation_table.py"))
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    part = readme.split(script["BEGIN"])[1].split(script["END"])[0]
-    assert part == f"\n{script['part_of_readme'](rows.values())}\n", "run scripts/write_equation_table.py --write"
+    assert read_part("equations") == f"\n{script['part_of_readme'](rows.values())}\n", (
+        "run scripts/write_equation_table.py --write"
+    )
 
 
 def test_the_tables_say_what_the_rows_say(rows: dict[str, Row]) -> None:
