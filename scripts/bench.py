@@ -57,12 +57,13 @@ import numpy as np  # noqa: E402
 from jax.sharding import Mesh, NamedSharding, PartitionSpec  # noqa: E402
 from readme import write_part  # noqa: E402
 
-from linemap_jax import Capacity, Mount, Pose, Scan, SensorNoise, build, empty_map, extract, preset, update  # noqa: E402
+from linemap_jax import Capacity, Mount, Pose, Scan, SensorNoise, empty_map, extract, preset, update  # noqa: E402
 from linemap_jax.build import COMPILER_OPTIONS  # noqa: E402
 from linemap_jax.core.extract import observe, with_defaults  # noqa: E402
 from linemap_jax.core.mapping import integrate  # noqa: E402
 from linemap_jax.core.settings import SCAN_CAPACITY, persistence_of  # noqa: E402
 from linemap_jax.core.slots import resize  # noqa: E402
+from linemap_jax.core.state import Extraction, LineMap  # noqa: E402
 from linemap_jax.io.log import open_log  # noqa: E402
 from linemap_jax.io.scans import chunks_of_readings  # noqa: E402
 from linemap_jax.lab import generators, scanners, simulate  # noqa: E402
@@ -167,14 +168,8 @@ def on_all_cores(dtype: str, choice: Preset) -> Row:
 
 
 def map_step(drive: tuple[Scan, Pose], capacity: int, dtype: str, *, quick: bool) -> Row:
-    """A row of `map_step`: a map of a simulated drive, thinned out, and a scan of it, again and again."""
-    scans, poses = cast(drive, dtype)
-    start = jax.tree.map(lambda x: x[:64], (scans, poses))
-    line_map, _ = build(*start, map_capacity=Capacity(256, 256), jacobians="analytic")
-    held = min(100, capacity)
-    line_map = jax.tree.map(jnp.asarray, filled(line_map, held))
-    line_map = type(line_map)(lines=resize(line_map.lines, capacity), circles=resize(line_map.circles, capacity))
-    scan, pose = jax.tree.map(lambda x: x[30], (scans, poses))
+    """A row of `map_step`: a simulated scan, again and again, into a map of what it sees and of more like that."""
+    scan, pose = cast(jax.tree.map(lambda x: x[30], drive), dtype)
     thresholds, noise, mount = with_defaults(None, None, None, np.dtype(dtype))
     rules = preset("default")["rules"]
     look = partial(
@@ -186,6 +181,8 @@ def map_step(drive: tuple[Scan, Pose], capacity: int, dtype: str, *, quick: bool
         jacobians="analytic",
     )
     points, pose, found = jax.jit(look)(scan, pose, thresholds, noise, mount)
+    line_map = jax.tree.map(jnp.asarray, filled(found, min(100, capacity)))
+    line_map = LineMap(lines=resize(line_map.lines, capacity), circles=resize(line_map.circles, capacity))
     lasting = jax.tree.map(partial(jnp.asarray, dtype=dtype), persistence_of("unknown", None))
 
     def several(line_map: Any, found: Any) -> Any:
@@ -370,8 +367,8 @@ def cast(tree: Any, dtype: str) -> Any:
     return jax.tree.map(lambda x: x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, tree)
 
 
-def filled(line_map: Any, count: int) -> Any:
-    """A map with so many lines and circles: those that it holds, over and over, each time 40 m farther away."""
+def filled(found: Extraction, count: int) -> LineMap:
+    """A map with so many lines and circles: those of a scan, over and over, each time 40 m farther away."""
 
     def slots(held: Any, place: str) -> Any:
         valid = np.flatnonzero(np.asarray(held.valid))
@@ -380,7 +377,7 @@ def filled(line_map: Any, count: int) -> Any:
         away = 40.0 * (np.arange(count) // len(valid))[:, None]
         return taken.replace(**{place: (getattr(taken, place) + away).astype(getattr(taken, place).dtype)})
 
-    return type(line_map)(lines=slots(line_map.lines, "anchor"), circles=slots(line_map.circles, "center"))
+    return LineMap(lines=slots(found.lines, "anchor"), circles=slots(found.circles, "center"))
 
 
 def as_table(rows: list[Row]) -> str:
