@@ -157,7 +157,7 @@ def extraction(scans: Scan, batch: int, dtype: str, choice: Preset, devices: int
         run = jax.shard_map(several, mesh=mesh, in_specs=split, out_specs=split, check_vma=False)
         given = jax.device_put(some, NamedSharding(mesh, split))
     row = {"name": "extract", "preset": choice, "batch": batch, "dtype": dtype, "devices": devices, "capacity": None}
-    return row | timed(run, given, scans=batch, quick=quick)
+    return row | timed(run, given, dtype=dtype, scans=batch, quick=quick)
 
 
 def on_all_cores(dtype: str, choice: Preset) -> Row:
@@ -195,7 +195,7 @@ def map_step(drive: tuple[Scan, Pose], capacity: int, dtype: str, *, quick: bool
         return jax.lax.scan(step, line_map, None, length=64)
 
     row = {"name": "map_step", "preset": "default", "batch": 1, "dtype": dtype, "devices": 1, "capacity": capacity}
-    return row | timed(several, line_map, found, scans=64, options=COMPILER_OPTIONS, quick=quick)
+    return row | timed(several, line_map, found, dtype=dtype, scans=64, options=COMPILER_OPTIONS, quick=quick)
 
 
 def scan_to_map(log: tuple[Scan, Pose], dtype: str, choice: Preset, *, quick: bool) -> Row:
@@ -213,11 +213,18 @@ def scan_to_map(log: tuple[Scan, Pose], dtype: str, choice: Preset, *, quick: bo
     capacity = Capacity(512, 512)
     row = {"name": "scan_to_map", "preset": choice, "batch": 1, "dtype": dtype, "devices": 1, "capacity": 512}
     given = empty_map(capacity, np.dtype(dtype)), scans, poses
-    return row | timed(several, *given, scans=count, options=COMPILER_OPTIONS, quick=quick)
+    return row | timed(several, *given, dtype=dtype, scans=count, options=COMPILER_OPTIONS, quick=quick)
 
 
-def timed(function: Callable[..., Any], *given: Any, scans: int, options: Any = None, quick: bool = False) -> Row:
+def timed(
+    function: Callable[..., Any], *given: Any, dtype: str, scans: int, options: Any = None, quick: bool = False
+) -> Row:
     """Compile, once more from the cache unless it has to be quick, and run for a second or so."""
+    with jax.enable_x64(dtype == "float64"):  # who works in float32 leaves it off, and has indices of 32 bits
+        return _timed(function, *given, scans=scans, options=options, quick=quick)
+
+
+def _timed(function: Callable[..., Any], *given: Any, scans: int, options: Any, quick: bool) -> Row:
     # Called as users call it: what `compile` gives has no quick way from Python.
     jitted = jax.jit(function, compiler_options=options)
 
