@@ -370,8 +370,14 @@ def pose_at(dtype: str) -> Pose:
 
 
 def cast(tree: Any, dtype: str) -> Any:
-    """The floats of a tree in one dtype."""
-    return jax.tree.map(lambda x: x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, tree)
+    """The floats of a tree in one dtype, and its integers in 32 bits."""
+
+    def one(x: Any) -> Any:
+        if jnp.issubdtype(x.dtype, jnp.floating):
+            return x.astype(dtype)
+        return x.astype(jnp.int32) if jnp.issubdtype(x.dtype, jnp.integer) else x
+
+    return jax.tree.map(one, tree)
 
 
 def filled(found: Extraction, count: int) -> LineMap:
