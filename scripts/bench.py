@@ -86,7 +86,7 @@ Row = dict[str, Any]
 def main() -> int:
     """Measure, print the table, and write the rows where that is asked for."""
     parser = argparse.ArgumentParser(description="How long a scan takes, beside a C++ extractor.")
-    parser.add_argument("--quick", action="store_true", help="four rows, within a minute")
+    parser.add_argument("--quick", action="store_true", help="four rows, in about a minute")
     parser.add_argument("--json", type=Path, help="write the rows to this file")
     parser.add_argument("--write", action="store_true", help="write the table into README")
     parser.add_argument(ALL_CORES, nargs=3, metavar=("DTYPE", "PRESET", "CORES"), help=argparse.SUPPRESS)

@@ -1,7 +1,5 @@
 """Runs of consecutive points: which points belong to which, and sums over them."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Shaped
@@ -40,17 +38,17 @@ class Runs:
         Whole runs must be chosen, and no more than `size` points.
 
         Returns:
-          The index of each point, `N` where there is none; the runs, in the same slots.
+          The index of each point, of any where there is none; the runs, in the same slots, those not chosen free.
         """
         n = which.shape[0]
         index = all_true(which, size)
         rank = rank_of_true(which)
         place = jnp.minimum(index, n - 1)
-        some = dataclasses.replace(
-            self,
-            first=jnp.minimum(rank[self.first], size - 1),
-            last=jnp.minimum(rank[self.last], size - 1),
-            valid=self.valid & which[self.first],
+        chosen = self.valid & which[self.first]
+        some = Runs(
+            first=jnp.where(chosen, rank[self.first], 0),
+            last=jnp.where(chosen, rank[self.last], 0),
+            valid=chosen,
             of_point=jnp.where(index < n, self.of_point[place], -1),
         )
         return place, some

@@ -216,6 +216,21 @@ def test_poles_of_few_beams_are_fitted_as_those_of_many() -> None:
     assert "cond[" in str(jax.make_jaxpr(jax.vmap(fit))(scans)), "all ways are gone by all"
 
 
+def test_some_runs_moved_together_have_the_same_sums() -> None:
+    """Also where there is no place to spare, and a run that is left out comes last."""
+    of_point = jnp.array([-1, 0, 0, -1, 1, 1, 1, 2, 2, -1, 3, 3])
+    first, last = jnp.array([1, 4, 7, 10, 0]), jnp.array([2, 6, 8, 11, 0])
+    runs = Runs(first=first, last=last, valid=jnp.arange(5) < 4, of_point=of_point)
+    per_point = jnp.arange(1.0, 13.0)
+    for chosen in ([0, 1], [1], [0, 2, 3], [1, 3]):
+        which = jnp.isin(of_point, jnp.array(chosen))
+        for spare in (0, 3):
+            index, some = runs.only(which, int(which.sum()) + spare)
+            expected = [float(per_point[of_point == k].sum()) if k in chosen else 0.0 for k in range(5)]
+            assert some.sum(per_point[index]).tolist() == expected
+            assert some.valid.tolist() == [k in chosen for k in range(5)]
+
+
 def test_clusters_of_one_point_are_no_circles() -> None:
     ranges = np.full(N, np.nan)
     ranges[[10, 40]] = 2.0, 4.0
