@@ -99,5 +99,22 @@ def test_the_table_of_departures_is_complete():
     assert list(table_below("The two presets")) == [field.name for field in dataclasses.fields(Rules)]
 
 
-def test_the_place_of_the_measured_table_is_there():
-    assert README.count("<!-- measured:begin -->") == README.count("<!-- measured:end -->") == 1
+def section(anchor: str) -> str:
+    """What stands below the heading that a link leads to."""
+    for text in README.split("\n## ")[1:]:
+        heading = text.split("\n", 1)[0]
+        if re.sub(r"[^a-z0-9 -]", "", heading.lower()).replace(" ", "-") == anchor:
+            return text
+    raise AssertionError(f"no section #{anchor}")
+
+
+def test_every_link_leads_to_a_section():
+    for anchor in re.findall(r"\]\(#([^)]*)\)", README):
+        assert section(anchor)
+
+
+def test_every_figure_at_the_top_stands_in_a_table_that_was_measured():
+    for claim, (figures, link) in table_below("What it gives that nothing else does").items():
+        measured = "".join(re.findall(r"<!-- [a-z-]+:begin -->(.*?)<!--", section(link[8:-1]), re.DOTALL))
+        for figure in re.findall(r"\d+\.\d+", figures):
+            assert figure in measured, f"{claim}: {figure}"
