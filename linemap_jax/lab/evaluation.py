@@ -3,7 +3,6 @@
 import dataclasses
 import math
 from collections.abc import Iterable, Iterator
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -13,13 +12,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from linemap_jax.core.frames import dot
 from linemap_jax.core.sensor import points_from_scan
-from linemap_jax.core.settings import Jacobians, Mount, Number
+from linemap_jax.core.settings import Mount, Number
 from linemap_jax.core.state import Circles, LineMap, Lines, Pose, Scan, SlotsT, pad_stack
 from linemap_jax.lab.scoring import Seen, expected, seen_nothing, survey
 from linemap_jax.lab.world import NEVER, Kind, Poles, Segments, World
 
 
-@partial(jax.jit, static_argnames="jacobians")
+@jax.jit
 def explained(
     line_map: LineMap,
     scans: Scan,
@@ -28,7 +27,6 @@ def explained(
     *,
     within: float | Array = 0.1,
     closer_than: float | Array = 20.0,
-    jacobians: Jacobians = "analytic",
 ) -> tuple[Int[Array, ""], Int[Array, ""]]:
     """How many returns lie on a primitive of the map.
 
@@ -41,7 +39,6 @@ def explained(
       mount: of the scanner on the robot.
       within: m.
       closer_than: only returns nearer than this count, m.
-      jacobians: of no consequence to the result.
 
     Returns:
       The number of explained returns, and of all that count.
@@ -52,8 +49,8 @@ def explained(
     def one(scan_pose: tuple[Scan, Pose]) -> tuple[Array, Array]:
         scan, pose = scan_pose
         finite = jnp.all(jnp.isfinite(pose.mean))
-        points = points_from_scan(scan, pose, placed, jacobians=jacobians)
-        counts = scan.valid & (scan.ranges < closer_than) & finite
+        points = points_from_scan(scan, pose, placed, jacobians="analytic")  # none is used
+        counts = points.valid & (points.range < closer_than) & finite
         near = jax.vmap(lambda p: _distance(line_map, p, pose.mean[:2]) < within)(points.position)
         return jnp.sum(near & counts), jnp.sum(counts)
 

@@ -10,7 +10,7 @@ import pytest
 from linemap_jax.core.mapping import empty_map
 from linemap_jax.core.settings import Capacity, Mount
 from linemap_jax.core.state import LineMap, Pose, Scan
-from linemap_jax.lab.evaluation import duplicates, evaluate_log, world_of_map
+from linemap_jax.lab.evaluation import duplicates, evaluate_log, explained, world_of_map
 
 BEARINGS = np.radians(np.arange(-60.0, 61.0, 2.0))
 BEAMS = BEARINGS.size
@@ -85,6 +85,15 @@ def test_a_log_that_is_off() -> None:
     # The same where the robot looks elsewhere, and the mount turns the scanner back to the east.
     turned = evaluate_log(wall_and_pole(), log(off, turn=0.4), Mount(theta=0.4), chunk=CHUNK)
     np.testing.assert_allclose(turned, score, atol=1e-9)
+
+
+@pytest.mark.parametrize("hidden", [slice(None, BEAMS // 2), slice(None, None, 2)])
+def test_beams_that_do_not_return_do_not_count(hidden: slice) -> None:
+    (scans, poses), *_ = log(np.zeros((3, BEAMS)))
+    scans = dataclasses.replace(scans, valid=scans.valid.at[:, hidden].set(False))
+    near = dataclasses.replace(scans, valid=scans.valid & (scans.ranges < 20))
+    hits, total = explained(wall_and_pole(), scans, poses)
+    assert hits == total == near.valid.sum() > 20
 
 
 def test_returns_without_a_map() -> None:
