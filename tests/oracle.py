@@ -155,8 +155,8 @@ class Report:
     deleted: int = 0
     status: int = 0
     tie_margin: float = math.inf
-    """By how much (NIS) the choice closest to a tie was decided. The fragments of a line that wiping has split have one
-    and the same NIS but for rounding, so two implementations may differ where this is of that size."""
+    """By how much (NIS) the choice closest to a tie was decided. Without merging, the fragments of a line that wiping
+    has split have one NIS but for rounding, so that two implementations may differ where this is of that size."""
 
 
 class Sweep(NamedTuple):
@@ -1572,7 +1572,7 @@ def remaining(extent: np.ndarray, cuts: list[tuple[float, float]], shortest: flo
     return [(a, b) for a, b in pieces if b > a and b - a >= shortest]
 
 
-def _cut(lines: Lines, cuts: Cuts, report: Report, *, thresholds: Any) -> list[int]:
+def _cut(lines: Lines, cuts: Cuts, sweep: Sweep, report: Report, *, thresholds: Any, rules: Any) -> list[int]:
     """Delete, trim and split lines, s6.3. Returns the slots of the deleted ones."""
     deleted = []
     for slot in sorted(cuts):
@@ -1591,11 +1591,27 @@ def _cut(lines: Lines, cuts: Cuts, report: Report, *, thresholds: Any) -> list[i
             if free is None:
                 report.status |= Status.MAP_LINES_FULL
                 break
-            _put(lines, free, **_piece(old, a, b))
+            # Merged again, the pieces must not know more than the line did: each has its part of the information.
+            weight = (b - a) / sum(q - p for p, q in pieces) if rules.merge else 1.0
+            var_ends = [
+                var_of_cut(old, end, sweep) if end != old.extent[0, side] else old.var_extent[0, side]
+                for side, end in enumerate((a, b))
+            ]
+            _put(lines, free, **_piece(old, a, b, np.array(var_ends), weight))
     return deleted
 
 
-def _piece(line: Lines, a: float, b: float) -> dict[str, Any]:
+def var_of_cut(line: Lines, along: float, sweep: Sweep) -> float:
+    """How well a beam tells where along a line (of length 1) it crossed it, and one beam more, evenly spread."""
+    place = line.point_at(np.array([along]))[0] - sweep.p
+    beam = place - sweep.laser
+    distance = float(np.linalg.norm(beam))
+    on_line = distance / max(abs(float(line.normal[0] @ beam)) / max(distance, EDGE_ON), GRAZING)
+    row = line.tangent[0] @ jac_point_pose(place)
+    return float(row @ sweep.cov_pose @ row + on_line**2 * (sweep.sa**2 + sweep.spacing**2 / 12))
+
+
+def _piece(line: Lines, a: float, b: float, var_ends: np.ndarray, weight: float) -> dict[str, Any]:
     """The part of a line (of length 1) from `a` to `b` along it, anchored in its middle."""
     anchor = line.point_at(np.array([(a + b) / 2]))[0]
     normal, tangent = line.normal[0], line.tangent[0]
@@ -1604,11 +1620,11 @@ def _piece(line: Lines, a: float, b: float) -> dict[str, Any]:
         "anchor": anchor,
         "offset": line.offset[0] + normal @ shift,
         "angle": line.angle[0],
-        "cov_independent": symmetric(sandwich(lever_matrix(tangent @ shift), line.cov_independent[0])),
+        "cov_independent": symmetric(sandwich(lever_matrix(tangent @ shift), line.cov_independent[0])) / weight,
         "sqrt_persistent": lever_matrix(tangent @ shift) @ line.sqrt_persistent[0],
         "first_angle": line.first_angle[0],
         "extent": np.array([a, b]) + tangent @ shift,
-        "var_extent": line.var_extent[0],
+        "var_extent": var_ends,
         "times_detected": line.times_detected[0],
         "valid": True,
     }
@@ -1869,9 +1885,10 @@ def update(
 
     if rules.wipe_by_beams:
         own = np.where(targets >= 0, targets, suspects)
-        _cut(lines, beam_cuts(lines, sweep, found, own, targets, thresholds=thresholds), report, thresholds=thresholds)
+        cuts = beam_cuts(lines, sweep, found, own, targets, thresholds=thresholds)
+        _cut(lines, cuts, sweep, report, thresholds=thresholds, rules=rules)
     elif mode == "simultaneous":
-        cuts: Cuts = {}
+        cuts = {}
         for slot in sorted({slot for slot in targets.tolist() if slot >= 0}):
             triangle = wipe_triangle(lines.take(slot), apex, thresholds=thresholds)
             if triangle is None:
@@ -1879,7 +1896,7 @@ def update(
             triangles.append(triangle)
             for j, intervals in triangle_cuts(lines, triangle, spare=slot).items():
                 cuts.setdefault(j, []).extend(intervals)
-        _cut(lines, cuts, report, thresholds=thresholds)
+        _cut(lines, cuts, sweep, report, thresholds=thresholds, rules=rules)
 
     _update_circles(
         new_map,
@@ -2020,7 +2037,7 @@ def _lines_one_by_one(
             continue
         triangles.append(triangle)
         cuts = triangle_cuts(lines, triangle, spare=int(targets[i]))
-        for slot in _cut(lines, cuts, report, thresholds=thresholds):
+        for slot in _cut(lines, cuts, sweep, report, thresholds=thresholds, rules=rules):
             # Its slot may go to another line, which these new lines never were.
             targets[targets == slot] = -1
             suspects[suspects == slot] = -1

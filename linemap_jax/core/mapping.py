@@ -342,6 +342,10 @@ def _sweep(
 ) -> _Sweep:
     """Section 6: by beams or by triangles."""
     slots = jnp.arange(lines.model.valid.shape[0], dtype=jnp.int32)
+
+    def var_cut(line: Lines, along: Array) -> Array:
+        return wiping.var_of_cut(line, along, points, pose, noise)
+
     if rules.wipe_by_beams:
         line_of_point = jnp.where(points.valid, found.line_of_beam[points.index], -1)
         times = jnp.where(lines.targets >= 0, lines.model.times_detected[lines.targets], 0)
@@ -353,7 +357,9 @@ def _sweep(
             lines.model,
             affected,
             lambda line, slot: wiping.passed_through(line, slot, swath, pose.cov, thresholds, noise),
+            var_cut,
             thresholds,
+            share_information=rules.merge,
         )
         gone = wiping.passed_circles(circles, swath, pose.cov, thresholds, noise)
     else:
@@ -363,7 +369,9 @@ def _sweep(
             return wiping.inside_triangles(line, slot, triangles)
 
         affected = jax.vmap(lambda line, slot: jnp.any(inside(line, slot)[2]))(lines.model, slots)
-        model, wiped = wiping.wipe_lines(lines.model, affected, inside, thresholds)
+        model, wiped = wiping.wipe_lines(
+            lines.model, affected, inside, var_cut, thresholds, share_information=rules.merge
+        )
         gone = wiping.circles_inside_triangles(circles, triangles)
     return _Sweep(neutral_where_free(model), wiped, gone)
 

@@ -159,7 +159,8 @@ class Rules:
     """A new line that passes the geometric gates but fails the statistical one is neither fused nor added. To add
     it, as the paper does, holds the same wall twice: the gate turns true matches away too."""
     merge: bool = True
-    """Lines of the map that overlap and agree become one."""
+    """Lines of the map that overlap and agree become one. Pieces into which a line was cut share its information, so
+    that a door that opens and closes does not make its wall better known."""
     estimate_ends: bool = True
     """End points are estimated. The rule of s5.1.2 only ever lengthens a line, so noise makes it grow."""
     weigh_circles: bool = True

@@ -26,7 +26,7 @@ from linemap_jax.core.state import Circles, Lines, Pose, pytree
 NEAR_PARALLEL = 1e-6
 """Cosine below which a beam and a line do not meet."""
 NEAREST_BASE = 1e-3
-"""m. A line this close to the scanner's own position spans no triangle."""
+"""m. A line this close to the scanner's own position spans no triangle; no distance counts for less."""
 
 
 @pytree
@@ -227,21 +227,56 @@ def inside_triangles(line: Lines, slot: Int[Array, ""], triangles: Triangles) ->
     return low, high, line.valid & triangles.valid & (triangles.own != slot) & (high > low)
 
 
+def var_of_cut(
+    line: Lines, along: Float[Array, ""], points: Points, pose: Pose, noise: SensorNoise
+) -> Float[Array, ""]:
+    """Variance along a line of where beams cut it, m^2.
+
+    That of where a beam crosses the line, and that of a uniform distribution over one beam: what is left may have ended
+    anywhere up to the first beam that passed it.
+
+    Args:
+      line: one line, no batch axis.
+      along: the place, m from its anchor.
+      points: of the scan.
+      pose: of the robot.
+      noise: of the sensor.
+    """
+    from_robot = line.anchor - pose.mean[:2] + line.offset * line.normal + along * line.tangent
+    from_laser = from_robot - points.laser
+    distance2 = dot(from_laser, from_laser)
+    cosine2 = dot(from_laser, line.normal) ** 2 / jnp.maximum(distance2, NEAREST_BASE**2)
+    # As for the ends of new lines, 6 degrees are as grazing as matters.
+    by_bearing = (noise.bearing_sigma**2 + points.spacing**2 / 12) * distance2 / jnp.maximum(cosine2, 0.01)
+    by_pose = jnp.concatenate([line.tangent, dot(perp(from_robot), line.tangent)[None]])
+    return quadratic(by_pose, pose.cov) + by_bearing
+
+
 def wipe_lines(
     model: Lines,
     affected: Bool[Array, " K"],
     stretches: Callable[[Lines, Int[Array, ""]], Stretches],
+    var_cut: Callable[[Lines, Float[Array, ""]], Float[Array, ""]],
     thresholds: Thresholds,
+    *,
+    share_information: bool,
 ) -> tuple[Lines, Wiped]:
     """Take the stretches that are gone out of the lines of the map: delete, trim, split (section 6.3).
 
     Fragments shorter than `min_length` go too. A line may be cut in several places.
 
+    All fragments of a line are one and the same estimate. Where lines of the map may be merged, what was measured once
+    would then count once for each of them; so they share its information, by their lengths. Covariances P / w_i with
+    weights that sum to one bound the fragments as if they were independent, and make P again of all of them (the bound
+    of covariance intersection). The paper, which merges nothing, leaves the covariance as it is.
+
     Args:
       model: the lines of the map.
       affected: the lines that may have to be cut; the others are not looked at.
       stretches: which stretches of a line are gone, given the line (no batch axis) and its slot.
+      var_cut: variance of an end that was cut, m^2, given the line and where the end is, m from the anchor.
       thresholds: `min_length`.
+      share_information: whether the fragments of a line do.
     """
     k = model.valid.shape[0]
 
@@ -259,7 +294,13 @@ def wipe_lines(
         pieces = jnp.sum(keep)
         free = all_true(~lines.valid, begin.shape[0])
         into = jnp.where(rank == 0, slot, free[rank - 1])
-        fragments = jax.vmap(_fragment, (None, 0, 0))(line, begin, end)
+        length = jnp.where(keep, jnp.maximum(end - begin, NEAREST_BASE), 0)
+        share = jnp.where(keep, length / jnp.maximum(jnp.sum(length), NEAREST_BASE), 1)
+        share = share if share_information else jnp.ones_like(share)
+        ends = jnp.stack([begin, end], -1)
+        var_ends = jax.vmap(jax.vmap(var_cut, (None, 0)), (None, 0))(line, ends)
+        var_ends = jnp.where(ends == line.extent[None], line.var_extent[None], var_ends)
+        fragments = jax.vmap(_fragment, (None, 0, 0, 0))(line, ends, var_ends, share)
         cut = jnp.any(gone[2])
         lines = dataclasses.replace(lines, valid=lines.valid.at[slot].set(~cut))
         lines = put(lines, jnp.where(keep & cut & (into < k), into, -1), fragments)
@@ -295,10 +336,16 @@ def remaining(
     return begin, jnp.where(keep, end, begin), keep
 
 
-def _fragment(line: Lines, begin: Float[Array, ""], end: Float[Array, ""]) -> Lines:
-    """A part of a line, anchored at its own middle."""
-    middle = line.anchor + line.offset * line.normal + (begin + end) / 2 * line.tangent
-    part = dataclasses.replace(line, extent=jnp.stack([begin, end]), valid=jnp.ones_like(line.valid))
+def _fragment(line: Lines, extent: Float[Array, "2"], var_extent: Float[Array, "2"], share: Float[Array, ""]) -> Lines:
+    """A part of a line with a share of its information, anchored at its own middle."""
+    middle = line.anchor + line.offset * line.normal + (extent[0] + extent[1]) / 2 * line.tangent
+    part = dataclasses.replace(
+        line,
+        cov_independent=line.cov_independent / share,
+        extent=extent,
+        var_extent=var_extent,
+        valid=jnp.ones_like(line.valid),
+    )
     return reanchor(part, middle)
 
 

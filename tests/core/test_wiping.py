@@ -13,6 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from linemap_jax import Capacity, LineMap, Rules, Thresholds, empty_map, update
+from linemap_jax.core.frames import reanchor
+from linemap_jax.core.mapping import merge_lines
 from linemap_jax.core.sensor import points_from_scan
 from linemap_jax.core.settings import Mount, SensorNoise
 from linemap_jax.core.state import Circles, Lines, Pose, Scan, empty_circles, empty_lines
@@ -107,7 +109,11 @@ def wipe_by(lines: Lines, corners: jax.Array) -> Any:
     )
     stretches = partial(inside_triangles, triangles=triangles)
     affected = jax.vmap(lambda line, slot: jnp.any(stretches(line, slot)[2]))(lines, jnp.arange(lines.valid.shape[0]))
-    return wipe_lines(lines, affected, stretches, Thresholds())
+    return wipe_lines(lines, affected, stretches, one_centimetre, Thresholds(), share_information=True)
+
+
+def one_centimetre(line: Lines, along: jax.Array) -> jax.Array:
+    return jnp.full_like(along, 1e-4)
 
 
 @pytest.mark.parametrize(
@@ -232,6 +238,40 @@ def test_an_open_door_is_cut_out_of_a_line() -> None:
     # The door's beams stand within one spacing of its posts.
     np.testing.assert_allclose([pieces[0][1], pieces[1][0]], [-0.5, 0.5], atol=3 * np.radians(1.1))
     np.testing.assert_allclose([pieces[0][0], pieces[1][1]], [-3, 3], atol=0.05)
+
+
+@pytest.mark.parametrize("pose_error", ["independent", "persistent", "unknown"])
+def test_a_door_that_opens_and_closes_does_not_make_its_wall_better_known(pose_error: Any) -> None:
+    before = lines_of(([3.0, -3.0], [3.0, 3.0]))
+
+    def door(line: Lines, slot: jax.Array) -> Any:
+        return jnp.array([-0.5]), jnp.array([1.5]), jnp.array([True])
+
+    pieces, _ = wipe_lines(before, before.valid, door, one_centimetre, Thresholds(), share_information=True)
+    assert pieces.valid.sum() == 2
+    np.testing.assert_allclose(1 / pieces.cov_independent[:2, 1, 1], 1e5 * np.array([2.5, 1.5]) / 4, rtol=1e-6)
+    # One of them grows over the other, and they are one again.
+    grown = dataclasses.replace(pieces, extent=pieces.extent.at[0, 1].add(4.0))
+    touched, alone = jax.tree.map(lambda x: x[:1], grown), jnp.zeros((1, 6), bool)
+    after, _, merged = merge_lines(grown, touched, jnp.zeros(1, jnp.int32), alone, Thresholds(), Rules(), pose_error)
+    assert merged == 1
+    again = jax.tree.map(lambda x: x[0], after)
+    np.testing.assert_allclose(
+        reanchor(again, before.anchor[0]).cov_independent, before.cov_independent[0], rtol=1e-5, atol=1e-11
+    )
+
+
+def test_an_end_that_was_cut_is_as_uncertain_as_the_beams_that_cut_it() -> None:
+    y = 3 * np.tan(BEARINGS)
+    after, _ = updated(lines_of(([3.0, -3.0], [3.0, 3.0])), np.where(np.abs(y) < 0.5, 2 * WALL, WALL))
+    valid = after.lines.valid
+    ends = jnp.stack([after.lines.begin, after.lines.end], 1)[valid]
+    at_door = jnp.abs(jnp.abs(ends[..., 1]) - 0.5) < 0.1
+    assert at_door.sum() == 2
+    per_radian = (3**2 + 0.5**2) / 3  # m along the wall
+    by_beam = per_radian**2 * (0.001**2 + (BEARINGS[1] - BEARINGS[0]) ** 2 / 12)
+    by_pose = 0.01**2 + (3 * 0.002) ** 2
+    np.testing.assert_allclose(after.lines.var_extent[valid][at_door], by_beam + by_pose, rtol=0.03)
 
 
 def test_short_fragments_go_too() -> None:
