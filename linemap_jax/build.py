@@ -60,11 +60,12 @@ def build(
     Raises:
       ValueError: if there is no scan, if scans and poses differ in number, or for what `update` refuses.
     """
+    if scans.ranges.ndim != 2 or poses.mean.ndim != 2:
+        shapes = f"ranges {scans.ranges.shape} and poses {poses.mean.shape}"
+        raise ValueError(f"scans and poses must be stacked, with ranges [T, N] and poses [T, 3], not {shapes}")
     count = scans.ranges.shape[0]
     if poses.mean.shape[0] != count:
         raise ValueError(f"{count} scans and {poses.mean.shape[0]} poses: there must be one pose for each scan")
-    if scans.ranges.ndim != 2:
-        raise ValueError(f"scans must be stacked, with ranges [T, N], not {scans.ranges.shape}")
     pieces = ((_slice(scans, i, i + chunk), _slice(poses, i, i + chunk)) for i in range(0, count, chunk))
     reports = []
     built = line_map or empty_map(map_capacity, scans.ranges.dtype)
