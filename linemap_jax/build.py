@@ -117,7 +117,9 @@ def build_chunks(
             full = Status(int(np.bitwise_or.reduce(np.asarray(report.status))))
             if not full & ~Status.POSE_NOT_FINITE:
                 break
-            line_map, capacity = _grow_map(line_map, full), _grow_scan(capacity, full)
+            if full & Status.MAP_FULL:
+                line_map = grow(line_map)
+            capacity = _grow_scan(capacity, full)
         line_map = after
         yield after, _slice(report, 0, count)
 
@@ -182,10 +184,17 @@ def update_chunk(
 _run = _jit(update_chunk)
 
 
-def _grow_map(line_map: LineMap, full: Status) -> LineMap:
-    """Twice the room for lines and circles where either ran out: the other soon would, and each growth is compiled."""
-    if not full & (Status.MAP_LINES_FULL | Status.MAP_CIRCLES_FULL):
-        return line_map
+def grow(line_map: LineMap) -> LineMap:
+    """A map with twice the slots for lines and circles: where either run out, the other soon would.
+
+    On the host; `update` is compiled once more for it.
+
+    Args:
+      line_map: the map.
+
+    Returns:
+      The same map, each primitive in its slot.
+    """
     lines, circles = line_map.lines, line_map.circles
     return LineMap(lines=resize(lines, 2 * lines.valid.shape[0]), circles=resize(circles, 2 * circles.valid.shape[0]))
 
