@@ -25,6 +25,7 @@ from linemap_jax.core.estimation.pose_graph import SURE, Closures, PoseGraph, co
 from linemap_jax.core.estimation.registration import RegistrationSettings
 from linemap_jax.core.estimation.surface import Surface, middle_of
 from linemap_jax.core.estimation.tracking import Track, Tracked, TrackingSettings, begin_track, track_chunk
+from linemap_jax.core.fields import documented
 from linemap_jax.core.frames_on_host import between, compose
 from linemap_jax.core.settings import SensorNoise, Thresholds
 from linemap_jax.core.state import LineMap, Lines, Pose, Scan, pad_stack
@@ -315,13 +316,18 @@ class Slam:
         return jac @ cov_keyframes[owner] @ np.swapaxes(jac, 1, 2) + own
 
 
+@documented
 class Slammed(NamedTuple):
     """A log whose poses were not known."""
 
     line_map: LineMap
-    trajectory: Float[np.ndarray, "T 3"]  # of the scanner at each scan. m, m, rad
-    cov: Float[np.ndarray, "T 3 3"]  # of these
+    """The map."""
+    trajectory: Float[np.ndarray, "T 3"]
+    """Poses of the scanner at each scan. m, m, rad."""
+    cov: Float[np.ndarray, "T 3 3"]
+    """Covariances of these: m^2, m rad, rad^2."""
     state: Slam
+    """From which it can go on."""
 
 
 def slam(

@@ -30,8 +30,11 @@ class Errors:
     """The error of an estimate of n numbers, in the two parts of `Lines` and `Circles`."""
 
     cov_independent: Float[Array, "*s n n"]
+    """Covariance of what no other scan shares."""
     sqrt_persistent: Float[Array, "*s n 3"]
+    """Square root of the covariance of what other scans may share."""
     times_detected: Int[Array, "*s"]
+    """How many scans have seen the primitive."""
 
 
 ErrorsT = TypeVar("ErrorsT", Errors, Lines, Circles)

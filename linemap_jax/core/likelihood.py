@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from linemap_jax.core.fields import documented
 from linemap_jax.core.frames import dot, perp, unit, wrap_angle
 from linemap_jax.core.propagation import apply, inverse
 from linemap_jax.core.runs import Runs
@@ -26,12 +27,16 @@ SHALLOW = 0.02
 """Cosine of the incidence (89 degrees) beyond which a beam does not say where it meets a line."""
 
 
+@documented
 class Linearised(NamedTuple):
     """The likelihood around some lines. Constants of the step, whatever they were computed from."""
 
     normal: Float[Array, "K 2"]
+    """Unit normals of the lines at which u was linearised."""
     anchor: Float[Array, "K 2"]
-    rows: Float[Array, "N 2"]  # d(offset, angle) / d(u) of each point's line, weighted: C (1, -s) / variance
+    """Anchors of the lines, in the coordinates of the points, m."""
+    rows: Float[Array, "N 2"]
+    """d(offset, angle) / d(u) of each point's line, weighted: C (1, -s) / variance."""
 
 
 def linearise(

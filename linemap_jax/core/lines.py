@@ -44,12 +44,19 @@ class Regression:
     """
 
     count: Float[Array, " K"]
-    origin: Float[Array, "K 2"]  # m, the first point
-    centroid: Float[Array, "K 2"]  # m, from the first point
+    """Number of points."""
+    origin: Float[Array, "K 2"]
+    """The first point, m."""
+    centroid: Float[Array, "K 2"]
+    """Mean of the points, from the first point, m."""
     steep: Bool[Array, " K"]
-    width: Float[Array, " K"]  # N_1 or N_2 of Eq. (6), m^2
+    """Whether x was regressed on y, (s, t), else y on x, (m, q)."""
+    width: Float[Array, " K"]
+    """N_1 or N_2 of Eq. (6), m^2."""
     slope: Float[Array, " K"]
-    direction: Float[Array, "K 2"]  # along the line, from the first point towards the last; not normalised
+    """m of Eq. (7), or s of Eq. (8)."""
+    direction: Float[Array, "K 2"]
+    """Along the line, from the first point towards the last; not normalised."""
 
 
 def regress(position: Float[Array, "N 2"], runs: Runs) -> Regression:

@@ -24,14 +24,22 @@ OVERLAP_WEIGHT = 1e-3
 class LineComparison:
     """A new line held against one of the map. No batch axis."""
 
-    offset: Float[Array, ""]  # innovation, new minus map, at the anchor of the new line, m
-    angle: Float[Array, ""]  # innovation, rad
-    lever: Float[Array, ""]  # of the shift S that moves a small change of the map's line to that anchor, m
-    sign: Float[Array, ""]  # -1 where the new line has to be taken reversed
-    nis: Float[Array, ""]  # Eq. (21)
-    gap: Float[Array, ""]  # m, along the line; negative where the segments overlap
-    collinear: Bool[Array, ""]  # passes the angle gate and the end-point gate
-    geometric: Bool[Array, ""]  # is collinear, and passes the gap gate
+    offset: Float[Array, ""]
+    """Innovation of the offset, new minus map, at the anchor of the new line, m."""
+    angle: Float[Array, ""]
+    """Innovation of the angle, rad."""
+    lever: Float[Array, ""]
+    """Lever of the shift S that moves a small change of the map's line to that anchor, m."""
+    sign: Float[Array, ""]
+    """-1 where the new line has to be taken reversed."""
+    nis: Float[Array, ""]
+    """Normalised distance, Eq. (21)."""
+    gap: Float[Array, ""]
+    """Gap along the line, m; negative where the segments overlap."""
+    collinear: Bool[Array, ""]
+    """Whether it passes the angle gate and the end-point gate."""
+    geometric: Bool[Array, ""]
+    """Whether it is collinear, and passes the gap gate."""
 
 
 @partial(jax.jit, static_argnames="pose_error")  # so that it is traced once, not once for each of its seven uses
@@ -151,10 +159,14 @@ def with_sign(cov: Float[Array, "*s 2 2"], sign: Float[Array, "*s"]) -> Float[Ar
 class LineMatches:
     """What matching says of each new line."""
 
-    slot: Int[Array, " L"]  # of the map, -1 for none
-    suspect: Int[Array, " L"]  # the line of the map that made a new line ambiguous, -1 for none
-    nis: Float[Array, " L"]  # of the best geometric candidate, before the statistical gate; 0 for none
-    compared: Bool[Array, " L"]  # there was a geometric candidate that was not another line's
+    slot: Int[Array, " L"]
+    """Slot in the map, -1 for none."""
+    suspect: Int[Array, " L"]
+    """The line of the map that made a new line ambiguous, -1 for none."""
+    nis: Float[Array, " L"]
+    """Normalised distance of the best geometric candidate, before the statistical gate; 0 for none."""
+    compared: Bool[Array, " L"]
+    """Whether there was a geometric candidate that was not another line's."""
 
 
 def compare_pieces(new: Lines, thresholds: Thresholds) -> LineComparison:
@@ -239,11 +251,16 @@ def group_lines(pair: LineComparison, unmatched: Bool[Array, " L"], thresholds: 
 class CircleMatches:
     """What matching says of each new circle."""
 
-    slot: Int[Array, " C"]  # of the map, -1 for none
-    distance: Float[Array, " C"]  # m, to the centre of that circle
-    nis: Float[Array, " C"]  # of the nearest within the distance gate, before the statistical one; 0 for none
+    slot: Int[Array, " C"]
+    """Slot in the map, -1 for none."""
+    distance: Float[Array, " C"]
+    """Distance to the centre of that circle, m."""
+    nis: Float[Array, " C"]
+    """Normalised distance of the nearest within the distance gate, before the statistical one; 0 for none."""
     dof: Int[Array, " C"]
-    ambiguous: Bool[Array, " C"]  # near a circle, but not it
+    """Degrees of freedom of that: 3, or 0 where nothing was compared."""
+    ambiguous: Bool[Array, " C"]
+    """Whether it is near a circle, but not it."""
 
 
 def match_circles(

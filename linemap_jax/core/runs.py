@@ -12,10 +12,14 @@ from linemap_jax.core.state import pytree
 class Runs:
     """Runs of consecutive points, one after the other in `K` slots."""
 
-    first: Int[Array, " K"]  # the first point, 0 for a free slot
-    last: Int[Array, " K"]  # the last point, 0 for a free slot
+    first: Int[Array, " K"]
+    """The first point of each run, 0 for a free slot."""
+    last: Int[Array, " K"]
+    """The last point of each run, 0 for a free slot."""
     valid: Bool[Array, " K"]
-    of_point: Int[Array, " N"]  # slot of each point's run, -1 for none
+    """Which slots are in use."""
+    of_point: Int[Array, " N"]
+    """Slot of each point's run, -1 for none."""
 
     def sum(self, per_point: Float[Array, "N *s"]) -> Float[Array, "K *s"]:
         """Sum over the points of each run, in one pass: each sum begins at the first point of its run."""

@@ -22,16 +22,26 @@ class Points:
     Positions are relative to the robot's, in the axes of the world.
     """
 
-    position: Float[Array, "N 2"]  # m
-    beam: Float[Array, "N 2"]  # unit vector along the beam
-    range: Float[Array, " N"]  # m
-    turn: Float[Array, " N"]  # rad, angle to the beam of the point before, 0 for the first
-    valid: Bool[Array, " N"]  # true for the returns, which stand first
-    index: Int[Array, " N"]  # beam of the scan, `N` where there is no return
-    jac_pose: Float[Array, "N 2 3"]  # F of Eq. (4)
-    jac_measurement: Float[Array, "N 2 2"]  # G of Eq. (4), with respect to (range, bearing)
-    laser: Float[Array, "2"]  # m, the scanner
-    spacing: Float[Array, ""]  # rad, between neighbouring beams
+    position: Float[Array, "N 2"]
+    """Points in the axes of the world, from the robot's position, m."""
+    beam: Float[Array, "N 2"]
+    """Unit vector along the beam."""
+    range: Float[Array, " N"]
+    """Measured ranges, m."""
+    turn: Float[Array, " N"]
+    """Angle to the beam of the point before, 0 for the first, rad."""
+    valid: Bool[Array, " N"]
+    """True for the returns, which stand first."""
+    index: Int[Array, " N"]
+    """Beam of the scan, `N` where there is no return."""
+    jac_pose: Float[Array, "N 2 3"]
+    """F of Eq. (4), d(point) / d(pose)."""
+    jac_measurement: Float[Array, "N 2 2"]
+    """G of Eq. (4), with respect to (range, bearing)."""
+    laser: Float[Array, "2"]
+    """The scanner, from the robot's position, m."""
+    spacing: Float[Array, ""]
+    """Angle between neighbouring beams, rad."""
 
     def per_beam(self, value: Int[Array, " N"]) -> Int[Array, " N"]:
         """A number of each point as one of each beam of the scan, -1 for beams without a return."""

@@ -10,6 +10,7 @@ from typing import Any, Literal, NamedTuple
 
 from jaxtyping import Array, Float
 
+from linemap_jax.core.fields import documented
 from linemap_jax.core.state import positional_pytree, pytree
 
 Number = float | Float[Array, ""]
@@ -123,17 +124,21 @@ def persistence_of(pose_error: PoseError, persistence: Persistence | None) -> Pe
     raise ValueError(f"pose_error must be 'independent', 'persistent' or 'unknown', not {pose_error!r}")
 
 
+@documented
 class Capacity(NamedTuple):
     """Number of slots: of a map, or of what one scan may hold. Static: it is part of the compiled shape."""
 
     lines: int = 256
+    """Slots for lines."""
     circles: int = 256
+    """Slots for circles."""
 
 
 SCAN_CAPACITY = Capacity(lines=32, circles=64)
 """Slots for what a single scan holds."""
 
 
+@documented
 @dataclasses.dataclass(frozen=True)
 class Rules:
     """Which reading of the method is meant. Static; every field is one departure from the paper, on by default."""

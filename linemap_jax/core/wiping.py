@@ -34,11 +34,17 @@ class Swath:
     """What the returns of a scan prove to be free."""
 
     points: Points
-    reach: Float[Array, " N"]  # m, with the extension behind the line that the beam met; 0 if it met none
-    own: Int[Array, " N"]  # slot of the map's line that the beam measures, -1 for none
-    times: Int[Array, " N"]  # how often that line was detected, 0 for none
-    joined: Bool[Array, " N"]  # neighbour of the next one
-    robot: Float[Array, "2"]  # m, in the world
+    """Points of the scan."""
+    reach: Float[Array, " N"]
+    """Range up to which the beam wipes, with the extension behind the line that it met; 0 if it met none. m."""
+    own: Int[Array, " N"]
+    """Slot of the map's line that the beam measures, -1 for none."""
+    times: Int[Array, " N"]
+    """How often that line was detected, 0 for none."""
+    joined: Bool[Array, " N"]
+    """Whether the beam is a neighbour of the next one."""
+    robot: Float[Array, "2"]
+    """Position of the robot in the world, m."""
 
 
 @pytree
@@ -46,11 +52,17 @@ class Triangles:
     """Wipe-triangles, section 6.2: the scanner and the pushed-back ends of a line, from the scanner."""
 
     first: Float[Array, "L 2"]
+    """Corner behind the begin of the line that the scan saw, from the laser, m."""
     second: Float[Array, "L 2"]
-    own: Int[Array, " L"]  # slot of the line that spans it
+    """Corner behind its end, from the laser, m."""
+    own: Int[Array, " L"]
+    """Slot of the line that spans it."""
     valid: Bool[Array, " L"]
-    apex: Float[Array, "2"]  # m, the laser from the robot
-    robot: Float[Array, "2"]  # m, in the world
+    """Which slots are in use."""
+    apex: Float[Array, "2"]
+    """The laser, from the robot, m."""
+    robot: Float[Array, "2"]
+    """Position of the robot in the world, m."""
 
 
 @pytree
@@ -58,9 +70,13 @@ class Wiped:
     """Counts of what wiping did to lines."""
 
     trimmed: Int[Array, ""]
+    """Lines shortened."""
     split: Int[Array, ""]
+    """Lines cut into several."""
     deleted: Int[Array, ""]
-    overflow: Bool[Array, ""]  # a fragment found no free slot
+    """Lines gone."""
+    overflow: Bool[Array, ""]
+    """Whether a fragment found no free slot."""
 
 
 Stretches = tuple[Float[Array, " M"], Float[Array, " M"], Bool[Array, " M"]]

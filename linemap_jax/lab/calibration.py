@@ -25,6 +25,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int
 
 from linemap_jax.core.extract import extract
+from linemap_jax.core.fields import documented
 from linemap_jax.core.frames import dot, perp, reanchor, unit, wrap_angle
 from linemap_jax.core.propagation import square_root
 from linemap_jax.core.settings import SCAN_CAPACITY, Capacity, Mount, SensorNoise
@@ -57,22 +58,30 @@ SMALLEST = 1e-6
 """No sigma is less, m or rad."""
 
 
+@documented
 class Estimate(NamedTuple):
     """Maximum-likelihood estimates of standard deviations."""
 
-    sigma: np.ndarray  # [n]
-    interval: np.ndarray  # [n, 2] of 95 %, from the curvature of the log-likelihood in log(sigma)
-    used: int  # residuals or innovations
+    sigma: np.ndarray
+    """Standard deviations."""
+    interval: np.ndarray
+    """Their intervals of 95 %, from the curvature of the log-likelihood in log(sigma)."""
+    used: int
+    """Number of residuals or innovations that were used."""
 
 
 @pytree
 class Residuals:
     """Beams about the lines that they lie on; `K` lines of `N` beams, of which each has some."""
 
-    along: Float[Array, "*t N"]  # m, range less the range at which the beam meets the line
-    by_line: Float[Array, "*t N 2"]  # derivative of the latter by offset (per unit) and angle (m)
-    sway: Float[Array, "*t N"]  # m / rad, by the bearing
-    line: Int[Array, "*t N"]  # slot of its line, -1 for beams that are not used
+    along: Float[Array, "*t N"]
+    """Range less the range at which the beam meets the line, m."""
+    by_line: Float[Array, "*t N 2"]
+    """Derivative of the latter by offset (per unit) and angle (m)."""
+    sway: Float[Array, "*t N"]
+    """Derivative by the bearing, m / rad."""
+    line: Int[Array, "*t N"]
+    """Slot of its line, -1 for beams that are not used."""
 
 
 @partial(jax.jit, static_argnames="capacity")
@@ -226,11 +235,16 @@ def sensor_noise(
 class Innovations:
     """Lines of one scan against those of another, `L` pairs; free slots are zero, with a variance of one."""
 
-    change: Float[Array, "*t L 2"]  # m, rad: the second less the first, at the anchor of the first
-    cov: Float[Array, "*t L 2 2"]  # of that from the sensor's noise
-    by_first: Float[Array, "*t L 2 3"]  # by the pose of the first scan
+    change: Float[Array, "*t L 2"]
+    """Offset and angle, the second less the first, at the anchor of the first. m, rad."""
+    cov: Float[Array, "*t L 2 2"]
+    """Covariance of that from the sensor's noise."""
+    by_first: Float[Array, "*t L 2 3"]
+    """Derivative by the pose of the first scan."""
     by_second: Float[Array, "*t L 2 3"]
+    """Derivative by the pose of the second scan."""
     valid: Bool[Array, "*t L"]
+    """Which slots are in use."""
 
 
 @partial(jax.jit, static_argnames="capacity")

@@ -26,6 +26,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from linemap_jax.core.extract import extract
+from linemap_jax.core.fields import documented
 from linemap_jax.core.frames import dot, unit, wrap_angle
 from linemap_jax.core.fusion import at_first_angle, forget, fuse_lines
 from linemap_jax.core.lines import MIN_POINTS, measure_lines
@@ -62,8 +63,10 @@ SEEN_BEAMS = 10
 class Walls:
     """Straight walls, the truth that lines are held against."""
 
-    point: Float[Array, "W 2"]  # m, on the wall
-    angle: Float[Array, " W"]  # rad, of the normal
+    point: Float[Array, "W 2"]
+    """A point on each wall, m."""
+    angle: Float[Array, " W"]
+    """Direction of its normal, rad."""
 
 
 def walls_of(world: World) -> Walls:
@@ -87,12 +90,16 @@ def nees(error: Float[Array, "*s n"], cov: Float[Array, "*s n n"]) -> Float[Arra
     return quadratic(error, inverse(cov))
 
 
+@documented
 class Sample(NamedTuple):
     """What one run has to say."""
 
     nees: Any
-    error: Any  # [n] the estimate less the truth, in axes of the experiment
-    counts: Any  # false where nothing was found
+    """Squared error of the estimate in units of its covariance."""
+    error: Any
+    """The estimate less the truth, in axes of the experiment, shape `[n]`."""
+    counts: Any
+    """False where nothing was found."""
 
 
 class Fit(enum.Enum):
@@ -218,11 +225,14 @@ def rho_errors(
     return errors, on_wall[line] >= MIN_POINTS
 
 
+@documented
 class Model(NamedTuple):
     """What a map believes of the pose's error."""
 
     pose_error: PoseError
+    """How the errors of the poses hang together."""
     persistence: Persistence | None = None
+    """How they go on, where `pose_error` is "persistent"."""
 
 
 def fused(
@@ -361,9 +371,13 @@ class Cell:
     """One configuration of a table."""
 
     world: World
-    path: Float[Array, "T 3"]  # true poses; the first one is where single scans are taken
+    """What the scanner is in."""
+    path: Float[Array, "T 3"]
+    """True poses; the first one is where single scans are taken."""
     scanner: Scanner
+    """The instrument."""
     cov_pose: Float[Array, "3 3"]
+    """Covariance of the poses' errors: m^2, m rad, rad^2."""
 
 
 def cells() -> dict[str, Cell]:
@@ -406,15 +420,22 @@ def cells() -> dict[str, Cell]:
     }
 
 
+@documented
 class Verdict(NamedTuple):
     """What many runs say of one configuration."""
 
     runs: int
-    found: float  # share of runs in which there was something to judge
+    """Number of runs."""
+    found: float
+    """Share of runs in which there was something to judge."""
     mean: float
+    """Mean of the NEES."""
     median: float
-    inside: float  # share inside the 95 % ellipse
-    bias: tuple[float, ...]  # mean of each number's error over its spread
+    """Median of the NEES."""
+    inside: float
+    """Share inside the 95 % ellipse."""
+    bias: tuple[float, ...]
+    """Mean of each number's error over its spread."""
 
 
 def judge(sample: Sample) -> Verdict:
@@ -441,11 +462,14 @@ def judge(sample: Sample) -> Verdict:
     )
 
 
+@documented
 class Bands(NamedTuple):
     """Where mean and coverage lie, with a given probability for all cells of a table together."""
 
     mean: tuple[float, float]
+    """Least and largest mean of the NEES."""
     inside: tuple[float, float]
+    """Least and largest share inside the 95 % ellipse."""
 
 
 def bands(runs: int, cells: int = 1, *, error: float = 0.001, dof: int = 2) -> Bands:

@@ -20,8 +20,10 @@ NOTHING = -1
 class Hits:
     """What beams meet."""
 
-    ranges: Float[Array, " N"]  # m, infinity where a beam meets nothing
-    thing: Int[Array, " N"]  # segment `i` is `i`, pole `j` is `S + j`, nothing is `NOTHING`
+    ranges: Float[Array, " N"]
+    """Ranges; infinity where a beam meets nothing. m."""
+    thing: Int[Array, " N"]
+    """Segment `i` is `i`, pole `j` is `S + j`, nothing is `NOTHING`."""
 
 
 def cast(world: World, origin: Float[Array, "2"], directions: Float[Array, "N 2"], *, scan_index: Time = 0) -> Hits:

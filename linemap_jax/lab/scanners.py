@@ -45,10 +45,14 @@ class Scanner:
 class Truth:
     """What the beams of a scan really did."""
 
-    bearings: Float[Array, " N"]  # rad, the true direction of each beam, in the frame of the scanner
-    ranges: Float[Array, " N"]  # m, without noise; infinity where the beam meets nothing
-    thing: Int[Array, " N"]  # what it meets, as in `Hits`; `NOTHING` for a mixed reading
-    mixed: Bool[Array, " N"]  # whether the reading lies between two things
+    bearings: Float[Array, " N"]
+    """The true direction of each beam, in the frame of the scanner, rad."""
+    ranges: Float[Array, " N"]
+    """Ranges without noise; infinity where the beam meets nothing. m."""
+    thing: Int[Array, " N"]
+    """What it meets, as in `Hits`; `NOTHING` for a mixed reading."""
+    mixed: Bool[Array, " N"]
+    """Whether the reading lies between two things."""
 
 
 def sweep(first: float, last: float, count: int) -> Float[Array, " N"]:

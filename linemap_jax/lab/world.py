@@ -41,23 +41,34 @@ class Kind(enum.IntEnum):
 class Segments:
     """Straight pieces of surface. Those of one body stand one behind the other and form a chain."""
 
-    ends: Float[Array, "S 2 2"]  # m, begin and end
-    body: Int[Array, " S"]  # which thing they belong to, from 0 on
-    kind: Int[Array, " S"]  # what that thing is, a `Kind`
-    appears: Int[Array, " S"]  # first scan in which it is there
-    vanishes: Int[Array, " S"]  # first scan in which it is gone
+    ends: Float[Array, "S 2 2"]
+    """Begin and end of each, m."""
+    body: Int[Array, " S"]
+    """Which thing they belong to, from 0 on."""
+    kind: Int[Array, " S"]
+    """What that thing is, a `Kind`."""
+    appears: Int[Array, " S"]
+    """First scan in which it is there."""
+    vanishes: Int[Array, " S"]
+    """First scan in which it is gone."""
     valid: Bool[Array, " S"]
+    """Which slots are in use."""
 
 
 @pytree
 class Poles:
     """Round things, solid."""
 
-    center: Float[Array, "C 2"]  # m
-    radius: Float[Array, " C"]  # m
-    appears: Int[Array, " C"]  # first scan in which it is there
-    vanishes: Int[Array, " C"]  # first scan in which it is gone
+    center: Float[Array, "C 2"]
+    """Centres, m."""
+    radius: Float[Array, " C"]
+    """Radii, m."""
+    appears: Int[Array, " C"]
+    """First scan in which it is there."""
+    vanishes: Int[Array, " C"]
+    """First scan in which it is gone."""
     valid: Bool[Array, " C"]
+    """Which slots are in use."""
 
 
 @pytree
@@ -68,8 +79,11 @@ class World:
     """
 
     segments: Segments
+    """Straight pieces of surface."""
     poles: Poles
-    path: Float[Array, "W 2"]  # m
+    """Round things."""
+    path: Float[Array, "W 2"]
+    """Way points, m."""
 
     @property
     def dtype(self) -> Any:

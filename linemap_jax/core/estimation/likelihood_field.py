@@ -39,9 +39,12 @@ Counts = tuple[tuple[int, int], ...]
 class LikelihoodField:
     """Distances to the nearest primitive of a map, at the centres of square cells."""
 
-    distance: Float[Array, "G G"]  # m, at most `FARTHEST`; by column (x) and row (y)
-    origin: Float[Array, "2"]  # m, lower left corner
-    cell: Float[Array, ""]  # m, side of a cell
+    distance: Float[Array, "G G"]
+    """Distance to the nearest surface of the map, at most `FARTHEST`, m; by column (x) and row (y)."""
+    origin: Float[Array, "2"]
+    """Lower left corner, m."""
+    cell: Float[Array, ""]
+    """Side of a cell, m."""
 
 
 def field_size(line_map: LineMap) -> int:

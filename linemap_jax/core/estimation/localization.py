@@ -130,11 +130,16 @@ class LocalizationSettings:
 class Belief:
     """What the filter knows of the pose. Primitives of the map are counted lines first, then circles."""
 
-    mean: Float[Array, "3"]  # x, y, theta; m, m, rad
-    cov_own: Float[Array, "3 3"]  # of the part that is independent of the map's errors
-    by_map: Float[Array, "3 M 2"]  # how the map's errors have moved the pose, each in units of its sigma
-    fit: Float[Array, ""]  # average over the latest scans, see `LocalizationSettings.least_fit`
+    mean: Float[Array, "3"]
+    """x, y, theta. m, m, rad."""
+    cov_own: Float[Array, "3 3"]
+    """Covariance of the part that is independent of the map's errors: m^2, m rad, rad^2."""
+    by_map: Float[Array, "3 M 2"]
+    """How the map's errors have moved the pose, each in units of its sigma."""
+    fit: Float[Array, ""]
+    """Average of the fit over the latest scans, see `LocalizationSettings.least_fit`."""
     lost: Bool[Array, ""]
+    """Whether the latest scans did not fit the map."""
 
     @property
     def cov(self) -> Float[Array, "3 3"]:
@@ -151,40 +156,62 @@ class Belief:
 class Located:
     """What the filter says after one scan."""
 
-    pose: Pose  # of the robot
-    nis: Float[Array, ""]  # of all sightings together
-    dof: Int[Array, ""]  # its degrees of freedom; 0 where nothing was used
-    lines: Int[Array, ""]  # how many lines, or groups of points, were used
-    circles: Int[Array, ""]  # how many circles
-    fit: Float[Array, ""]  # share of the returns explained, less share that contradict the map
+    pose: Pose
+    """Pose of the robot in the map."""
+    nis: Float[Array, ""]
+    """Normalised innovation squared of all sightings together."""
+    dof: Int[Array, ""]
+    """Its degrees of freedom; 0 where nothing was used."""
+    lines: Int[Array, ""]
+    """How many lines, or groups of points, were used."""
+    circles: Int[Array, ""]
+    """How many circles were used."""
+    fit: Float[Array, ""]
+    """Share of the returns explained, less share that contradict the map."""
     status: Int[Array, ""]
+    """Bits of `Status`."""
 
 
 @pytree
 class Seen:
     """What a scan holds, in the frame of the robot."""
 
-    lines: Lines  # with covariances of the measurement alone
-    circles: Circles  # likewise
-    collinear: Bool[Array, "L L"]  # which lines may be pieces of one
-    points: Float[Array, "N 2"]  # m
-    beams: Float[Array, "N 2"]  # unit vectors
-    ranges: Float[Array, " N"]  # m
+    lines: Lines
+    """Lines in the frame of the robot, with covariances of the measurement alone."""
+    circles: Circles
+    """Circles, likewise."""
+    collinear: Bool[Array, "L L"]
+    """Which lines may be pieces of one."""
+    points: Float[Array, "N 2"]
+    """Points in the frame of the robot, m."""
+    beams: Float[Array, "N 2"]
+    """Unit vectors along the beams."""
+    ranges: Float[Array, " N"]
+    """Measured ranges, m."""
     returned: Bool[Array, " N"]
-    alone: Bool[Array, " N"]  # returned, and in no line nor fitted circle
-    laser: Float[Array, "2"]  # m
+    """Which beams came back."""
+    alone: Bool[Array, " N"]
+    """Returned, and in no line nor fitted circle."""
+    laser: Float[Array, "2"]
+    """The scanner, m."""
 
 
 @pytree
 class Sightings:
     """y = H error + A e + v for some primitives of the map. Free slots hold zeros, and a covariance of ones."""
 
-    slot: Int[Array, " S"]  # of the map; lines first, then circles
-    innovation: Float[Array, "S 2"]  # y, seen minus expected: of (offset, angle) of a line, of the centre of a circle
-    jac_pose: Float[Array, "S 2 3"]  # H
-    by_map: Float[Array, "S 2 2"]  # A
-    cov: Float[Array, "S 2 2"]  # of v
+    slot: Int[Array, " S"]
+    """Slot in the map; lines first, then circles."""
+    innovation: Float[Array, "S 2"]
+    """y, seen minus expected: of (offset, angle) of a line, of the centre of a circle."""
+    jac_pose: Float[Array, "S 2 3"]
+    """H, derivative of the expectation by the pose."""
+    by_map: Float[Array, "S 2 2"]
+    """A, how the errors of the map's primitive enter, each in units of its sigma."""
+    cov: Float[Array, "S 2 2"]
+    """Covariance of v, the noise of the sighting."""
     valid: Bool[Array, " S"]
+    """Which slots are in use."""
 
 
 def believe(pose: Pose, line_map: LineMap) -> Belief:

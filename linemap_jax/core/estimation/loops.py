@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from linemap_jax.core.estimation.registration import RegistrationSettings, register
 from linemap_jax.core.estimation.surface import Surface, seen_from
+from linemap_jax.core.fields import documented
 from linemap_jax.core.frames import wrap_angle
 from linemap_jax.core.settings import Number
 from linemap_jax.core.state import pytree
@@ -59,13 +60,18 @@ class LoopSettings:
     """What is another direction, rad."""
 
 
+@documented
 class Closure(NamedTuple):
     """What a keyframe says of an older one."""
 
-    step: Float[Array, "3"]  # pose of the newer one, seen from the older. m, m, rad
-    information: Float[Array, "3 3"]  # as if the points' errors were independent
-    share: Float[Array, ""]  # of the points, those that agree
+    step: Float[Array, "3"]
+    """Pose of the newer one, seen from the older. m, m, rad."""
+    information: Float[Array, "3 3"]
+    """Information on the step, as if the points' errors were independent."""
+    share: Float[Array, ""]
+    """Share of the points that agree."""
     believed: Bool[Array, ""]
+    """Whether the two keyframes are taken to see one place."""
 
 
 def joined(surfaces: Surface, poses: Float[Array, "S 3"], valid: Bool[Array, " S"]) -> Surface:

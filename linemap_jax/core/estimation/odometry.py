@@ -54,8 +54,10 @@ class GyroscopeNoise:
 class Increment:
     """A step of the robot: its pose seen from the one before it, and the covariance."""
 
-    mean: Float[Array, "3"]  # x ahead, y to the left, turn; m, m, rad
-    cov: Float[Array, "3 3"]  # m^2, m rad, rad^2
+    mean: Float[Array, "3"]
+    """x ahead, y to the left, turn. m, m, rad."""
+    cov: Float[Array, "3 3"]
+    """Covariance of these: m^2, m rad, rad^2."""
 
 
 def increment_from_poses(

@@ -24,26 +24,34 @@ GATE_2D = 9.21
 class Beacons:
     """Beacons in the world, and where they are."""
 
-    position: Float[Array, "B 2"]  # m
+    position: Float[Array, "B 2"]
+    """Places in the world, m."""
     valid: Bool[Array, " B"]
+    """Which slots are in use."""
 
 
 @pytree
 class BeaconReadings:
     """What a sensor on the robot measured of beacons."""
 
-    measurement: Float[Array, "R 2"]  # range and bearing, in the frame of the sensor; m, rad
-    beacon: Int[Array, " R"]  # which one it is, -1 where that is not known
+    measurement: Float[Array, "R 2"]
+    """Range and bearing, in the frame of the sensor; m, rad."""
+    beacon: Int[Array, " R"]
+    """Which beacon it is, -1 where that is not known."""
     valid: Bool[Array, " R"]
+    """Which slots are in use."""
 
 
 @pytree
 class BeaconReport:
     """What became of each reading."""
 
-    beacon: Int[Array, " R"]  # the one that it was used for, -1 if it was not used
-    nis: Float[Array, " R"]  # normalised innovation squared of the best candidate, before the gate; 0 for none
-    dof: Int[Array, " R"]  # 2; 0 where nothing was compared
+    beacon: Int[Array, " R"]
+    """Beacon that it was used for, -1 if it was not used."""
+    nis: Float[Array, " R"]
+    """Normalised innovation squared of the best candidate, before the gate; 0 for none."""
+    dof: Int[Array, " R"]
+    """Degrees of freedom: 2, or 0 where nothing was compared."""
 
 
 def predict(pose: Pose, increment: Increment, *, jacobians: Jacobians = "analytic") -> Pose:

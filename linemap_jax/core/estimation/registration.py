@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from linemap_jax.core.estimation.surface import Surface, seen_from
+from linemap_jax.core.fields import documented
 from linemap_jax.core.frames import dot, perp, wrap_angle
 from linemap_jax.core.propagation import apply, inverse
 from linemap_jax.core.settings import Number
@@ -38,12 +39,16 @@ class RegistrationSettings:
     """Points nearer than this to the surface agree with it, m."""
 
 
+@documented
 class Registration(NamedTuple):
     """A scan laid onto a surface."""
 
-    pose: Float[Array, "3"]  # m, m, rad
-    information: Float[Array, "3 3"]  # from the points alone, as if their errors were independent
-    share: Float[Array, ""]  # of the scan's points, those that agree with the surface
+    pose: Float[Array, "3"]
+    """Pose of the scan in the frame of the surface. m, m, rad."""
+    information: Float[Array, "3 3"]
+    """Information on the pose from the points alone, as if their errors were independent."""
+    share: Float[Array, ""]
+    """Share of the scan's points that agree with the surface."""
 
 
 def register(

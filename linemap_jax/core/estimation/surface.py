@@ -22,10 +22,14 @@ _FLATNESS = 0.1  # largest ratio of the two principal variances of a piece of wa
 class Surface:
     """Points of a surface, in some frame."""
 
-    position: Float[Array, "M 2"]  # m
-    normal: Float[Array, "M 2"]  # unit vector, towards the scanner; of no meaning unless flat
-    flat: Bool[Array, " M"]  # whether the neighbours of the point lie on one line with it
+    position: Float[Array, "M 2"]
+    """Points, m."""
+    normal: Float[Array, "M 2"]
+    """Unit vector, towards the scanner; of no meaning unless flat."""
+    flat: Bool[Array, " M"]
+    """Whether the neighbours of the point lie on one line with it."""
     valid: Bool[Array, " M"]
+    """Which slots are in use."""
 
 
 def surface_of_scan(scan: Scan, points: int = POINTS) -> Surface:

@@ -13,22 +13,32 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
+from linemap_jax.core.fields import documented
 from linemap_jax.core.frames import dot
 from linemap_jax.core.sensor import Points
 from linemap_jax.core.settings import Number, Rules, SensorNoise, Thresholds
 
 
+@documented
 class Run(NamedTuple):
     """The run under extraction, as it stands at some point; the running sums of Eq. (5) are from its first point."""
 
-    n: Array  # number of points
-    x0: Array  # first point
+    n: Array
+    """Number of points."""
+    x0: Array
+    """First point, x, m."""
     y0: Array
+    """First point, y, m."""
     rx: Array
+    """R_x of Eq. (5), from the first point, m."""
     ry: Array
+    """R_y, m."""
     rxx: Array
+    """R_xx, m^2."""
     ryy: Array
+    """R_yy, m^2."""
     rxy: Array
+    """R_xy, m^2."""
 
 
 class _Step(NamedTuple):

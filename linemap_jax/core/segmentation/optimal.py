@@ -49,14 +49,22 @@ LEAST_RING = 8
 class Segmented:
     """The runs of a scan, and with a budget the lines of its polyline."""
 
-    points: Points  # those of the scan; of a closed ring, in the order from where it was cut open
-    ends: Bool[Array, " N"]  # the last points of runs
-    run: Run  # at the last point of a run, its sums
-    on_line: Bool[Array, " N"]  # false for points that are left to the circles
-    goes_on: Bool[Array, " N"]  # the last points of runs behind which the next one begins, without a gap
-    breaks: Int[Array, "3"]  # how many points broke a run by criteria 1, 2 and 3
-    begin: Float[Array, "V 2"]  # m, of the lines of the polyline, in the coordinates of the points
+    points: Points
+    """Points of the scan; of a closed ring, in the order from where it was cut open."""
+    ends: Bool[Array, " N"]
+    """The last points of runs."""
+    run: Run
+    """At the last point of a run, its sums."""
+    on_line: Bool[Array, " N"]
+    """False for points that are left to the circles."""
+    goes_on: Bool[Array, " N"]
+    """The last points of runs behind which the next one begins, without a gap."""
+    breaks: Int[Array, "3"]
+    """How many points broke a run by criteria 1, 2 and 3."""
+    begin: Float[Array, "V 2"]
+    """Begin points of the lines of the polyline, in the coordinates of the points, m."""
     end: Float[Array, "V 2"]
+    """Their other end points, m."""
 
 
 def segment(points: Points, thresholds: Thresholds, noise: SensorNoise, *, max_vertices: int | None) -> Segmented:
