@@ -195,7 +195,14 @@ class Slam:
         self._weight = np.asarray(graph.closures.weight)[: len(self._closures)]
 
     def graph(self, room: Callable[[int], int] | None = None) -> PoseGraph:
-        """Keyframes and closures, padded: to powers of two, or to what `room` gives for their number."""
+        """Keyframes and closures, padded: to powers of two, or to what `room` gives for their number.
+
+        Args:
+          room: how many slots for so many keyframes or closures; a power of two unless given.
+
+        Returns:
+          The graph.
+        """
         kept, count = self._keyframes, len(self._poses)
         n = (room or _room)(count)
         e = (room or _room)(len(self._closures))
@@ -305,6 +312,12 @@ class Slam:
         """Covariances of these, from those of the keyframes; m^2, m rad, rad^2.
 
         A scan between two keyframes errs as the one before it, and by its own registration.
+
+        Args:
+          cov_keyframes: of their poses, from `adjust`: m^2, m rad, rad^2. Shape `[N, 3, 3]`.
+
+        Returns:
+          Shape `[T, 3, 3]`.
         """
         owner, seen = np.concatenate(self._keyframe_of_scan), np.concatenate(self._seen_from_keyframe)
         theta = self._poses[owner, 2]
@@ -346,6 +359,12 @@ def slam(
       thresholds: of the map.
       noise: of the scanner.
       **settings: those of `Slam`.
+
+    Returns:
+      The map, the trajectory with its covariances, and the state, from which it can go on.
+
+    Raises:
+      TypeError: for a setting that `Slam` does not have.
     """
     state, count, places = Slam(**settings), scans.ranges.shape[0], np.asarray(odometry)
     for i in range(0, count, CHUNK):

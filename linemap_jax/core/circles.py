@@ -107,6 +107,12 @@ def jac_arc_points(position: Float[Array, "N 2"], clusters: Runs, *, jacobians: 
       position: the points, in metres. Shape `[N, 2]`.
       clusters: which points belong together, at least two in each.
       jacobians: "autodiff": three reverse passes through the estimate; "analytic": derived by hand.
+
+    Returns:
+      Derivatives without unit. Shape `[N, 3, 2]`.
+
+    Raises:
+      ValueError: at trace time, if `jacobians` is neither.
     """
     if jacobians == "autodiff":
         arcs, pull_back = jax.vjp(lambda x: arcs_from_points(x, clusters), position)
@@ -379,6 +385,14 @@ def near_lines(circles: Circles, lines: Lines, thresholds: Thresholds) -> Bool[A
     """Section 4.3.1: which circles lie too close to a line to be modelled; they are probably its noise.
 
     A fitted circle is a body, and is held against the line with its rim: the bent end of a wall has a centre behind it.
+
+    Args:
+      circles: `C` circles.
+      lines: `K` lines.
+      thresholds: `circle_line_distance`.
+
+    Returns:
+      Which circles are too close; false for free slots. Shape `[C]`.
     """
 
     def distance2(center: Float[Array, "2"], line: Lines) -> Float[Array, ""]:

@@ -67,6 +67,9 @@ def regress(position: Float[Array, "N 2"], runs: Runs) -> Regression:
     Args:
       position: the points, in metres. Shape `[N, 2]`.
       runs: which points belong together.
+
+    Returns:
+      A fit for each run; of a free slot it means nothing, and is finite.
     """
     # The origin is a constant of the sums, not a variable of the estimate: shifting all sums changes no line.
     origin = jax.lax.stop_gradient(position[runs.first])
@@ -125,6 +128,12 @@ def jac_line_points(
       runs: the lines that they belong to.
       anchor: of each line, held fixed. Shape `[K, 2]`.
       jacobians: "autodiff": two reverse passes through the estimate; "analytic": H J by the paper's way.
+
+    Returns:
+      H J, without unit, and rad/m. Shape `[N, 2, 2]`.
+
+    Raises:
+      ValueError: at trace time, if `jacobians` is neither.
     """
     if jacobians == "autodiff":
         _, pull_back = jax.vjp(lambda x: line_from_regression(regress(x, runs), anchor), position)
@@ -142,7 +151,17 @@ def jac_line_points(
 def jac_regression_points(
     position: Float[Array, "N 2"], runs: Runs, fit: Regression, anchor: Float[Array, "K 2"]
 ) -> Float[Array, "N 2 2"]:
-    """J of Eq. (12), derived by hand: d(m, q) / d(x, y), or d(s, t) / d(x, y), with the intercept at the anchor."""
+    """J of Eq. (12), derived by hand: d(m, q) / d(x, y), or d(s, t) / d(x, y), with the intercept at the anchor.
+
+    Args:
+      position: the points, in metres. Shape `[N, 2]`.
+      runs: the lines that they belong to.
+      fit: `regress` of both.
+      anchor: of each line, held fixed, m. Shape `[K, 2]`.
+
+    Returns:
+      J of each point's line; 1/m, and without unit. Shape `[N, 2, 2]`.
+    """
     centre = fit.origin + fit.centroid
     columns = [x[:, None] for x in (fit.count, fit.width, fit.slope, fit.steep.astype(anchor.dtype))]
     mine = runs.spread(jnp.concatenate([*columns, centre, centre - anchor], -1))
@@ -170,6 +189,13 @@ def jac_line_regression(fit: Regression, anchor: Float[Array, "K 2"]) -> Float[A
     Departures from the paper, whose print is wrong: the labels of the off-diagonal elements of H are swapped in
     (16)-(17); the sign that |.| of Eq. (9) takes away is kept; the (s, t) case has its own H, with
     d(angle)/ds = -1/(1 + s^2).
+
+    Args:
+      fit: the regressions.
+      anchor: of each line, held fixed, m. Shape `[K, 2]`.
+
+    Returns:
+      H of each line; m, without unit, and rad, rad/m. Shape `[K, 2, 2]`.
     """
     a = fit.slope
     norm2 = 1 + a * a
@@ -214,6 +240,9 @@ def measure_lines(
 
     Returns:
       The lines in the world; P, shape `[K, 2, 3]`; M, shape `[K, 2, 2]`, both for (offset, angle).
+
+    Raises:
+      ValueError: at trace time, for a `covariance` or `jacobians` that does not exist.
     """
     fit = regress(points.position, runs)
     robot = pose.mean[None, :2]
@@ -259,7 +288,17 @@ def measure_lines(
 def line_extent(
     position: Float[Array, "N 2"], runs: Runs, anchor: Float[Array, "K 2"], angle: Float[Array, " K"]
 ) -> Float[Array, "K 2"]:
-    """Section 4.2.4: the first and the last point of each run, projected on its line; metres from the anchor."""
+    """Section 4.2.4: the first and the last point of each run, projected on its line; metres from the anchor.
+
+    Args:
+      position: the points, in metres. Shape `[N, 2]`.
+      runs: the lines that they belong to.
+      anchor: of each line, in the coordinates of the points, m. Shape `[K, 2]`.
+      angle: of each line's normal, rad. Shape `[K]`.
+
+    Returns:
+      Begin and end along the tangent, m. Shape `[K, 2]`.
+    """
     tangent = jnp.stack([-jnp.sin(angle), jnp.cos(angle)], -1)
     return jnp.stack([dot(tangent, position[i] - anchor) for i in (runs.first, runs.last)], -1)
 

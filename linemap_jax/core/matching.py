@@ -54,6 +54,9 @@ def compare_lines(new: Lines, model: Lines, thresholds: Thresholds, pose_error: 
       thresholds: `match_...`.
       pose_error: its model. "persistent": what persists is one error in both lines, and cancels as far as it moves
         both alike. Else the two are taken for independent, as Eq. (21) does.
+
+    Returns:
+      Innovation, normalised distance, gap, and which gates the pair passes. No batch axis.
     """
     turn = wrap_angle(new.angle - model.angle)
     reverse = jnp.abs(turn) > jnp.pi / 2
@@ -145,12 +148,12 @@ def best_line(
 
 
 def normal_variance(cov: Float[Array, "2 2"], along: Float[Array, "*s"]) -> Float[Array, "*s"]:
-    """Variance of a line's position along its normal, `along` metres from the anchor, m^2."""
+    """Variance of a line along its normal, m^2, at `along` metres from the anchor, from its covariance `cov`."""
     return cov[0, 0] - 2 * along * cov[0, 1] + along**2 * cov[1, 1]
 
 
 def with_sign(cov: Float[Array, "*s 2 2"], sign: Float[Array, "*s"]) -> Float[Array, "*s 2 2"]:
-    """Covariance of (sign offset, angle)."""
+    """Covariance of (sign offset, angle), from `cov`, that of (offset, angle), and a `sign` of 1 or -1."""
     one = jnp.ones_like(sign)
     return cov * jnp.stack([jnp.stack([one, sign], -1), jnp.stack([sign, one], -1)], -2)
 
@@ -173,6 +176,13 @@ def compare_pieces(new: Lines, thresholds: Thresholds) -> LineComparison:
     """Hold the lines of a scan against each other, each with each: `[L, L]`.
 
     They share the pose: what its error adds to both is the same, and the sensor's noise alone tells them apart.
+
+    Args:
+      new: the `L` lines of a scan.
+      thresholds: `match_...`.
+
+    Returns:
+      All comparisons, stacked `[L, L]`.
     """
 
     def compare(a: Lines, b: Lines) -> LineComparison:
@@ -202,6 +212,9 @@ def match_lines(
       thresholds: `match_...`.
       rules: `share_pose`, `leave_out_ambiguous`.
       pose_error: its model.
+
+    Returns:
+      For each new line its line of the map, or which one stands in its way.
     """
     slot, nis = best_line(new, model, thresholds, pose_error)
     compared = jnp.isfinite(nis)
@@ -270,6 +283,16 @@ def match_circles(
 
     The nearest is taken. The paper's one criterion is the distance of the centres; fitted circles have a covariance,
     and by default must pass a chi-square gate on centre and radius too.
+
+    Args:
+      new: the `C` circles of a scan.
+      model: the `K` circles of the map.
+      thresholds: `circle_match_distance`, `circle_match_nis`.
+      rules: `weigh_circles`, `leave_out_ambiguous`.
+      pose_error: its model, as of `compare_lines`.
+
+    Returns:
+      For each new circle its circle of the map.
     """
     step = new.center[:, None] - model.center[None]
     near = new.valid[:, None] & model.valid[None]

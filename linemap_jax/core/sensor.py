@@ -44,7 +44,7 @@ class Points:
     """Angle between neighbouring beams, rad."""
 
     def per_beam(self, value: Int[Array, " N"]) -> Int[Array, " N"]:
-        """A number of each point as one of each beam of the scan, -1 for beams without a return."""
+        """`value`, a number of each point, as one of each beam of the scan, -1 for beams without a return."""
         return jnp.full(value.shape, -1, value.dtype).at[self.index].set(value, mode="drop")
 
 
@@ -59,6 +59,9 @@ def point_from_measurement(
       pose: (x, y, theta) of the robot. m, m, rad.
       measurement: (range, bearing). m, rad.
       mount: (x, y, theta) of the scanner on the robot. m, m, rad.
+
+    Returns:
+      The point in the world, m. Shape `[2]`.
     """
     return pose[:2] + rotate(pose[2], mount[:2]) + measurement[0] * unit(pose[2] + mount[2] + measurement[1])
 
@@ -66,7 +69,16 @@ def point_from_measurement(
 def jac_point_pose(
     pose: Float[Array, "3"], measurement: Float[Array, "2"], mount: Float[Array, "3"]
 ) -> Float[Array, "2 3"]:
-    """F of Eq. (4), derived by hand: d(point) / d(x, y, theta). Arguments as in `point_from_measurement`."""
+    """F of Eq. (4), derived by hand: d(point) / d(x, y, theta).
+
+    Args:
+      pose: as in `point_from_measurement`.
+      measurement: as there.
+      mount: as there.
+
+    Returns:
+      Without unit, and m in the last column. Shape `[2, 3]`.
+    """
     c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
     cb, sb = jnp.cos(pose[2] + mount[2] + measurement[1]), jnp.sin(pose[2] + mount[2] + measurement[1])
     one, zero = jnp.ones_like(c), jnp.zeros_like(c)
@@ -78,14 +90,23 @@ def jac_point_pose(
 def jac_point_measurement(
     pose: Float[Array, "3"], measurement: Float[Array, "2"], mount: Float[Array, "3"]
 ) -> Float[Array, "2 2"]:
-    """G of Eq. (4), derived by hand: d(point) / d(range, bearing). Arguments as in `point_from_measurement`."""
+    """G of Eq. (4), derived by hand: d(point) / d(range, bearing).
+
+    Args:
+      pose: as in `point_from_measurement`.
+      measurement: as there.
+      mount: as there.
+
+    Returns:
+      Without unit, and m in the last column. Shape `[2, 2]`.
+    """
     angle = pose[2] + mount[2] + measurement[1]
     c, s = jnp.cos(angle), jnp.sin(angle)
     return jnp.stack([jnp.stack([c, -measurement[0] * s]), jnp.stack([s, measurement[0] * c])])
 
 
 def cov_measurement(noise: SensorNoise) -> Float[Array, "2 2"]:
-    """C_s of Eq. (4): range and bearing are not correlated."""
+    """C_s of Eq. (4), from the `noise` of the sensor: range and bearing are not correlated. m^2, rad^2."""
     return jnp.diag(jnp.stack([jnp.asarray(noise.range_sigma), jnp.asarray(noise.bearing_sigma)]) ** 2)
 
 
@@ -95,7 +116,17 @@ def cov_point(
     cov_pose: Float[Array, "3 3"],
     noise: SensorNoise,
 ) -> Float[Array, "*s 2 2"]:
-    """C_p of Eq. (4), from F and G, in m^2. It holds the pose error that all points of the scan share."""
+    """C_p of Eq. (4). It holds the pose error that all points of the scan share.
+
+    Args:
+      jac_pose: F of each point. Shape `[*s, 2, 3]`.
+      jac_measurement: G of each point. Shape `[*s, 2, 2]`.
+      cov_pose: of (x, y, theta): m^2, m rad, rad^2. Shape `[3, 3]`.
+      noise: of the sensor, m and rad.
+
+    Returns:
+      Of (x, y) of each point, m^2. Shape `[*s, 2, 2]`.
+    """
     return propagate(jac_pose, cov_pose) + propagate(jac_measurement, cov_measurement(noise))
 
 
@@ -107,6 +138,9 @@ def points_from_scan(scan: Scan, pose: Pose, mount: Mount, *, jacobians: Jacobia
       pose: of the robot, in the world.
       mount: of the scanner, on the robot.
       jacobians: "autodiff" or "analytic".
+
+    Returns:
+      `N` points; those that are not valid stand last.
     """
     # The position of the robot is left out: it adds nothing to the derivatives, and takes digits from the points.
     here = pose.mean.at[:2].set(0)

@@ -114,6 +114,13 @@ class Persistence:
 def persistence_of(pose_error: PoseError, persistence: Persistence | None) -> Persistence:
     """What of a pose error persists under a model of it; where nothing is known, all of it may.
 
+    Args:
+      pose_error: "independent", "persistent" or "unknown".
+      persistence: the model of "persistent"; `Persistence()` unless given.
+
+    Returns:
+      What persists, and how long.
+
     Raises:
       ValueError: if there is no such model.
     """
@@ -196,6 +203,12 @@ PAPER_RULES = Rules(**{field.name: False for field in dataclasses.fields(Rules)}
 
 def preset(name: Literal["default", "paper"]) -> dict[str, Any]:
     """The keyword arguments of `extract`, `update` and `build` that make up a preset.
+
+    Args:
+      name: "default" or "paper".
+
+    Returns:
+      A dictionary of `thresholds`, `rules` and `covariance`.
 
     Raises:
       ValueError: if there is no preset of that name.

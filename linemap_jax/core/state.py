@@ -371,7 +371,7 @@ SlotsT = TypeVar("SlotsT", Lines, Circles)
 
 
 def squared(root: Float[Array, "*s n m"]) -> Float[Array, "*s n n"]:
-    """A A^T, the matrix of which A is a square root."""
+    """A A^T, the matrix of which A = `root` is a square root."""
     return jnp.sum(root[..., :, None, :] * root[..., None, :, :], -1)
 
 
@@ -382,7 +382,7 @@ LEFT_OUT = -2
 
 
 def empty_lines(capacity: int, dtype: Any = None) -> Lines:
-    """`capacity` free slots for lines. The dtype is jax's default unless given."""
+    """`capacity` free slots for lines. The `dtype` is jax's default unless given."""
     dtype = jnp.asarray(0.0).dtype if dtype is None else jax.dtypes.canonicalize_dtype(dtype)
     return Lines(
         anchor=_filled((capacity, 2), 0, dtype),
@@ -399,7 +399,7 @@ def empty_lines(capacity: int, dtype: Any = None) -> Lines:
 
 
 def empty_circles(capacity: int, dtype: Any = None) -> Circles:
-    """`capacity` free slots for circles. The dtype is jax's default unless given."""
+    """`capacity` free slots for circles. The `dtype` is jax's default unless given."""
     dtype = jnp.asarray(0.0).dtype if dtype is None else jax.dtypes.canonicalize_dtype(dtype)
     return Circles(
         center=_filled((capacity, 2), 0, dtype),
@@ -418,9 +418,9 @@ def _filled(shape: tuple[int, ...], value: float, dtype: Any) -> Array:
 
 
 def pad_stack(stacked: Any, size: int) -> Any:
-    """Stacked items filled up to `size` by repeating the last one; whoever uses them knows how many count.
+    """The items of the pytree `stacked`, filled up to `size` by repeating the last one.
 
-    On the host, where nothing has to be compiled.
+    Whoever uses them knows how many count. On the host, where nothing has to be compiled.
     """
 
     def fill(x: Array) -> Array:

@@ -102,6 +102,9 @@ def swath_of_scan(
       own: for each new line the line of the map that it is, or may be; -1 for none.
       times: how often that line was detected; 0 if the new line is no part of it.
       thresholds: `wipe_extension`, `gap_beams`.
+
+    Returns:
+      What `passed_through` needs, of `N` beams.
     """
     to_line = found.anchor - (pose.mean[:2] + points.laser)[None]
     across = jnp.abs(found.offset + dot(found.normal, to_line))  # the scanner from each line
@@ -140,6 +143,9 @@ def passed_through(
       cov_pose: covariance of the pose.
       thresholds: `wipe_...`, `match_distance`.
       noise: of the sensor.
+
+    Returns:
+      Begin and end of each stretch, m from the anchor, and whether it is gone. Shapes `[N - 1]`.
     """
     points = swath.points
     normal, tangent = line.normal, line.tangent
@@ -172,6 +178,15 @@ def may_have_passed(line: Lines, slot: Int[Array, ""], swath: Swath, thresholds:
     """Whether `passed_through` can find anything: false for nearly all lines of a map, and cheap to tell.
 
     Two beams must pass a line by `match_distance`, or reach behind it; no spread is computed, and nothing divided.
+
+    Args:
+      line: one line, no batch axis, directed.
+      slot: where it stands in the map.
+      swath: the beams.
+      thresholds: `match_distance`.
+
+    Returns:
+      Whether it is worth while to look.
     """
     points = swath.points
     normal, tangent = line.normal, line.tangent
@@ -199,6 +214,9 @@ def triangles_of_scan(
       model: the lines of the map.
       targets: the slots of those lines, -1 for none.
       thresholds: `wipe_extension`.
+
+    Returns:
+      `L` triangles; not valid for slots of -1, and where the laser lies on the line.
     """
     base = take(model, targets)
     apex = (pose.mean[:2] + points.laser)[None]
@@ -225,6 +243,9 @@ def inside_triangles(line: Lines, slot: Int[Array, ""], triangles: Triangles) ->
       line: one line, no batch axis.
       slot: where it stands in the map.
       triangles: of this scan.
+
+    Returns:
+      Begin and end of each stretch, m from the anchor, and whether there is one. Shapes `[L]`.
     """
     start = line.anchor - triangles.robot - triangles.apex + line.offset * line.normal
     tangent = line.tangent
@@ -257,6 +278,9 @@ def var_of_cut(
       points: of the scan.
       pose: of the robot.
       noise: of the sensor.
+
+    Returns:
+      The variance, m^2.
     """
     from_robot = line.anchor - pose.mean[:2] + line.offset * line.normal + along * line.tangent
     from_laser = from_robot - points.laser
@@ -293,6 +317,9 @@ def wipe_lines(
       var_cut: variance of an end that was cut, m^2, given the line and where the end is, m from the anchor.
       thresholds: `min_length`.
       share_information: whether the fragments of a line do.
+
+    Returns:
+      The lines of the map, with fragments in free slots; and how many were trimmed, split and deleted.
     """
     k = model.valid.shape[0]
 
@@ -372,6 +399,16 @@ def passed_circles(
 
     A circle is gone if every beam through the window in which it may stand, at least two of them, ends beyond it; and
     if it is wide enough for no two beams to pass it by on either side.
+
+    Args:
+      circles: the `C` circles of the map.
+      swath: the beams.
+      cov_pose: covariance of the pose: m^2, m rad, rad^2. Shape `[3, 3]`.
+      thresholds: `wipe_sigmas`.
+      noise: of the sensor.
+
+    Returns:
+      Which of them are gone. Shape `[C]`.
     """
 
     def gone(center: Array, radius: Array) -> Array:
@@ -397,7 +434,15 @@ def passed_circles(
 
 
 def circles_inside_triangles(circles: Circles, triangles: Triangles) -> Bool[Array, " C"]:
-    """Section 6.3: circles are deleted if they lie inside a wipe-triangle. Taken by their centres."""
+    """Section 6.3: circles are deleted if they lie inside a wipe-triangle. Taken by their centres.
+
+    Args:
+      circles: the `C` circles of the map.
+      triangles: of this scan.
+
+    Returns:
+      Which of them are gone. Shape `[C]`.
+    """
 
     def inside(center: Array, first: Array, second: Array) -> Array:
         start = center - triangles.robot - triangles.apex

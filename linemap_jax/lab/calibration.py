@@ -92,6 +92,9 @@ def residuals_of(scan: Scan, noise: SensorNoise, *, capacity: Capacity = SCAN_CA
       scan: `N` beams.
       noise: what is believed until now; decides with the thresholds what is a line.
       capacity: slots for lines.
+
+    Returns:
+      The residuals of the beams that lie on a line; zeros for the others.
     """
     here = Pose(mean=jnp.zeros(3, scan.ranges.dtype), cov=jnp.zeros((3, 3), scan.ranges.dtype))
     found = extract(scan, here, noise=noise, capacity=capacity, jacobians="analytic")
@@ -174,13 +177,25 @@ def restricted_likelihood(log_sigma: Float[Array, "2"], residuals: Residuals, ca
       log_sigma: logarithms of the sigmas of a range (m) and of a bearing (rad).
       residuals: of `N` beams.
       capacity: slots of the lines.
+
+    Returns:
+      The logarithm.
     """
     fits = _fit(log_sigma, residuals, capacity)
     return -jnp.sum(jnp.where(fits.points > 0, fits.log_det + fits.misfit, 0)) / 2
 
 
 def single_surfaces(log_sigma: Float[Array, "2"], residuals: Residuals, capacity: int) -> Residuals:
-    """The residuals without those of lines that fit too badly to be one surface, by `MISFIT`."""
+    """The residuals without those of lines that fit too badly to be one surface, by `MISFIT`.
+
+    Args:
+      log_sigma: logarithms of the sigmas of a range (m) and of a bearing (rad).
+      residuals: of `N` beams.
+      capacity: slots of the lines.
+
+    Returns:
+      The residuals, with fewer lines.
+    """
     fits = _fit(log_sigma, residuals, capacity)
     dof = jnp.maximum(fits.points - 2, 1)
     bad = fits.misfit > dof + MISFIT * jnp.sqrt(2 * dof)
@@ -205,6 +220,9 @@ def sensor_noise(
       start: what is believed at first.
       capacity: slots for the lines of a scan.
       rounds: how often is estimated.
+
+    Returns:
+      Two sigmas, m and rad, and their 95 % intervals.
 
     Raises:
       ValueError: if hardly a line was found.
@@ -251,7 +269,18 @@ class Innovations:
 def innovations_of(
     scans: Scan, poses: Float[Array, "2 3"], noise: SensorNoise, mount: Mount, *, capacity: Capacity = SCAN_CAPACITY
 ) -> Innovations:
-    """The innovation of two scans, `[2, N]`, at the poses that are believed."""
+    """The innovation of two scans, `[2, N]`, at the poses that are believed.
+
+    Args:
+      scans: two, stacked.
+      poses: of the robot at both, as believed. m, m, rad. Shape `[2, 3]`.
+      noise: of the sensor.
+      mount: of the scanner on the robot.
+      capacity: slots for the lines of a scan.
+
+    Returns:
+      For each line of the first scan by how much its view in the second differs; not valid where it has none.
+    """
     nothing = jnp.zeros((3, 3), poses.dtype)
 
     def found_at(t: int) -> Extraction:
@@ -326,6 +355,9 @@ def innovation_likelihood(log_sigma: Float[Array, "5"], innovations: Innovations
     Args:
       log_sigma: logarithms of the sigmas of x, y (m) and theta (rad), and of W: offset (m) and angle (rad).
       innovations: `L` pairs of lines.
+
+    Returns:
+      The logarithm.
     """
     scale, walls = jnp.exp(log_sigma[:3]), jnp.exp(2 * log_sigma[3:])
     count = innovations.valid.shape[0]
@@ -369,6 +401,9 @@ def pose_noise(
       lag: from one scan of a pair to the other; errors that last longer are not seen.
       capacity: slots for the lines of a scan.
 
+    Returns:
+      Five sigmas: m, m, rad; m, rad; and their 95 % intervals.
+
     Raises:
       ValueError: if there is no pair, or hardly any line is seen by both scans of a pair.
     """
@@ -398,6 +433,9 @@ def maximise(negative: Callable[[Array, Any], Array], start: Float[Array, " n"],
       start: log(sigma) at first.
       data: a pytree of arrays.
       used: how many numbers the data holds, for the record.
+
+    Returns:
+      The sigmas, with intervals from the curvature at the maximum.
     """
     optimiser = optax.lbfgs()
 

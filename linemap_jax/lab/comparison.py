@@ -147,7 +147,10 @@ def compare_maps(
 
 
 def holm(p: Float[np.ndarray, " M"]) -> Float[np.ndarray, " M"]:
-    """The p-values of Holm's step-down procedure: to reject those below alpha errs at all with probability alpha."""
+    """The p-values of Holm's step-down procedure, from `p`, those of the single tests.
+
+    To reject those below alpha errs at all with probability alpha.
+    """
     order = np.argsort(p)
     scaled = np.maximum.accumulate((p.size - np.arange(p.size)) * p[order])
     adjusted = np.empty_like(p)
@@ -176,6 +179,9 @@ def looked_through(
       mount: of the scanner on the robot.
       chunk: size to which pieces are filled up.
       slack: m.
+
+    Returns:
+      The same changes, those in question with `passed` and `met`.
     """
     meant = [i for i, change in enumerate(changes) if change.what == what]
     lines = [i for i in meant if changes[i].kind == "line"]

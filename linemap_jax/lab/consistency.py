@@ -70,13 +70,16 @@ class Walls:
 
 
 def walls_of(world: World) -> Walls:
-    """The segments of a world as boundless lines."""
+    """The segments of a `world` as boundless lines."""
     step = world.segments.ends[:, 1] - world.segments.ends[:, 0]
     return Walls(point=world.segments.ends.mean(1), angle=jnp.arctan2(step[:, 1], step[:, 0]) - jnp.pi / 2)
 
 
 def line_error(lines: Lines, wall: Walls) -> Float[Array, "*s 2"]:
-    """The error of (offset, angle), at the anchor of the line. A line may lie either way round."""
+    """The error of (offset, angle) of `lines` that are a `wall`, at their anchors. m, rad.
+
+    A line may lie either way round.
+    """
     turn = wrap_angle(lines.angle - wall.angle)
     reverse = jnp.abs(turn) > jnp.pi / 2
     turn = jnp.where(reverse, turn - jnp.sign(turn) * jnp.pi, turn)
@@ -86,7 +89,7 @@ def line_error(lines: Lines, wall: Walls) -> Float[Array, "*s 2"]:
 
 
 def nees(error: Float[Array, "*s n"], cov: Float[Array, "*s n n"]) -> Float[Array, "*s"]:
-    """Normalised estimation error squared, e^T C^-1 e, for n of 2 or 3."""
+    """Normalised estimation error squared, e^T C^-1 e, of e = `error` and C = `cov`, for n of 2 or 3."""
     return quadratic(error, inverse(cov))
 
 
@@ -127,6 +130,9 @@ def known_points(
       pose: the true one.
       scanner: its noise is what the fit believes.
       cov_pose: of the pose's error.
+
+    Returns:
+      One sample for each kind of fit.
     """
     of_wall, of_scan, of_pose = jax.random.split(key, 3)
     which, _ = _visible_wall(of_wall, world, pose, scanner)
@@ -157,6 +163,9 @@ def pipeline(
       scanner: its noise is what the extraction believes.
       cov_pose: of the pose's error.
       **options: of `extract`.
+
+    Returns:
+      The sample of the longest line, and those of all lines, `[K]`.
     """
     of_wall, of_scan, of_pose = jax.random.split(key, 3)
     which, seen = _visible_wall(of_wall, world, pose, scanner)
@@ -444,6 +453,9 @@ def judge(sample: Sample) -> Verdict:
     Args:
       sample: stacked, of two numbers (lines) or three (circles).
 
+    Returns:
+      What the runs say together.
+
     Raises:
       ValueError: if there are fewer than two runs that count.
     """
@@ -492,6 +504,6 @@ def bands(runs: int, cells: int = 1, *, error: float = 0.001, dof: int = 2) -> B
 
 
 def holds(verdict: Verdict, band: Bands) -> bool:
-    """Whether mean and coverage lie in their bands."""
+    """Whether mean and coverage of a `verdict` lie in their `band`."""
     in_mean = band.mean[0] <= verdict.mean <= band.mean[1]
     return in_mean and band.inside[0] <= verdict.inside <= band.inside[1]

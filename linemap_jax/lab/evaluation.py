@@ -199,6 +199,9 @@ def evaluate_log(
       chunks: stacked scans and poses, at most `chunk` of them each time.
       mount: of the scanner on the robot.
       chunk: size to which pieces are filled up.
+
+    Returns:
+      Shares and residuals; NaN where there is nothing to judge by.
     """
     line_map = _without_free_slots(line_map)
     hits = total = 0
@@ -237,7 +240,7 @@ def seen_in_log(
 
 
 def world_of_map(line_map: LineMap) -> World:
-    """The world that a map describes: each line a wall, each circle a pole."""
+    """The world that `line_map` describes: each line a wall, each circle a pole."""
     lines, circles = line_map.lines, line_map.circles
     index = jnp.arange(lines.valid.shape[0], dtype=jnp.int32)
 

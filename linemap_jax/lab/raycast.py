@@ -37,6 +37,9 @@ def cast(world: World, origin: Float[Array, "2"], directions: Float[Array, "N 2"
       origin: where the beams start, m.
       directions: unit vectors; their dtype is that of the ranges. Shape `[N, 2]`.
       scan_index: when.
+
+    Returns:
+      Ranges in metres, and which thing each beam meets.
     """
     # Differences first: far from the origin of the world, a lower precision would lose them.
     dtype = directions.dtype

@@ -58,13 +58,29 @@ class Seen:
 
 
 def seen_nothing(world: World, *, cells: int = CELLS) -> Seen:
-    """Before the first scan. More cells than are needed cost time only."""
+    """Before the first scan. More cells than are needed cost time only.
+
+    Args:
+      world: of `S` segments and `C` poles.
+      cells: into how many cells a segment is divided at most; more than are needed cost time only.
+
+    Returns:
+      Zeros.
+    """
     segments, poles = world.segments.valid.shape[0], world.poles.valid.shape[0]
     return Seen(cells=jnp.zeros((segments, cells), jnp.int32), poles=jnp.zeros(poles, jnp.int32))
 
 
 def seen_everything(world: World, *, cells: int = CELLS) -> Seen:
-    """As if each cell and pole had been seen in more scans than anyone asks for."""
+    """As if each cell and pole had been seen in more scans than anyone asks for.
+
+    Args:
+      world: of `S` segments and `C` poles.
+      cells: as of `seen_nothing`.
+
+    Returns:
+      Large numbers.
+    """
     return jax.tree.map(lambda x: jnp.full_like(x, NEVER), seen_nothing(world, cells=cells))
 
 
@@ -88,6 +104,9 @@ def look(
       pose: the true one, of the robot.
       mount: of the scanner on the robot.
       gates: `cell`; the same for all scans.
+
+    Returns:
+      The numbers of scans, with this one.
     """
     gates = gates or Gates()
     segments, poles = world.segments.valid.shape[0], world.poles.valid.shape[0]
@@ -119,6 +138,9 @@ def expected(
       pose: of the robot.
       mount: of the scanner on the robot.
       scan_index: when.
+
+    Returns:
+      What each beam meets, and how far away.
     """
     origin, heading = _placed(pose, mount)
     hits = cast(world, origin, unit(heading + scan.bearings), scan_index=scan_index)
@@ -148,6 +170,9 @@ def survey(
       mount: of the scanner on the robot.
       first: scan index of the first one.
       gates: `cell`.
+
+    Returns:
+      The numbers of scans, with these.
     """
 
     def step(seen: Seen, x: tuple[Scan, Array, Array]) -> tuple[Seen, None]:
@@ -297,6 +322,9 @@ def evaluate(
       seen: of that world; only what has been seen can be missed. All of it unless given.
       scan_index: what is there at this scan is the truth.
       gates: what counts as the same.
+
+    Returns:
+      Lengths, counts and errors, of each line, circle, wall and pole.
     """
     gates = gates or Gates()
     seen = seen_everything(world) if seen is None else seen
@@ -412,6 +440,9 @@ def judge_matches(
       truth: what the beams met.
       scan_index: of the scan.
       gates: what counts as the same.
+
+    Returns:
+      How many lines of the scan were matched rightly, wrongly, or not though they should have been.
     """
     gates = gates or Gates()
     walls = _walls(world)
@@ -462,7 +493,14 @@ def scans_until(
 
 
 def times_of_objects(world: World) -> tuple[Int[Array, " O"], Int[Array, " O"], Bool[Array, " O"]]:
-    """When each object appears and vanishes, and which of them there are. Bodies by their number, then poles."""
+    """When each object appears and vanishes, and which of them there are. Bodies by their number, then poles.
+
+    Args:
+      world: of `S` segments and `C` poles; `O = S + C`.
+
+    Returns:
+      First scan with it, first scan without it, and whether there is such an object. Shapes `[O]`.
+    """
     segments, poles = world.segments, world.poles
     count = segments.valid.shape[0]
     into = jnp.where(segments.valid, segments.body, count)

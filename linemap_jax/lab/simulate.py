@@ -52,6 +52,9 @@ def simulate(
       odometry: how well the wheels count.
       mount: of the scanner on the robot.
       turns: how the robot drives; see `robot.drive`.
+
+    Returns:
+      What a log would hold, and the truth.
     """
     of_scans, of_poses, of_odometry = jax.random.split(key, 3)
     true_poses = drive(world.path, count=count, turns=turns)

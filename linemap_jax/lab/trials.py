@@ -151,6 +151,9 @@ def trial(
       segmentation: how points are divided into lines.
       covariance: "exact" or "printed".
       jacobians: "autodiff" or "analytic".
+
+    Returns:
+      Counts and sums, from which `summary` makes shares.
     """
     world, scanner = run.world, conditions.scanner
     dtype = world.dtype
@@ -273,7 +276,7 @@ def sweep(thresholds: Thresholds, names: Sequence[str]) -> tuple[list[tuple[str,
 
 
 def columns_of(outcomes: Outcome) -> dict[str, np.ndarray]:
-    """Stacked outcomes as the columns of a table, by the names of the fields."""
+    """Stacked `outcomes` as the columns of a table, by the names of the fields."""
     return {field.name: np.asarray(getattr(outcomes, field.name)) for field in dataclasses.fields(Outcome)}
 
 
@@ -282,6 +285,9 @@ def summary(columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
 
     Args:
       columns: as of `columns_of`, `[R]` rows each.
+
+    Returns:
+      Numbers by their names, for JSON.
     """
     total = {field.name: np.sum(columns[field.name], 0) for field in dataclasses.fields(Outcome)}
 
@@ -329,6 +335,12 @@ def mistakes(columns: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]
     The kinds are line on no wall, wall without a line, wall that is held twice, match that is false, match that was
     missed, object that has vanished and is still in the map after `SCANS_TO_NOTICE` scans, and one that has come and is
     not. Both shapes `[R, 7]`.
+
+    Args:
+      columns: as of `columns_of`, `[R]` rows each.
+
+    Returns:
+      How much went wrong, and out of how much. Shapes `[R, 7]`.
     """
     c = {field.name: np.asarray(columns[field.name], float) for field in dataclasses.fields(Outcome)}
     matches = c["true_matches"] + c["false_matches"] + c["missed_matches"]

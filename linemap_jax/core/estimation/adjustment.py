@@ -86,6 +86,9 @@ def sightings_of_scan(
       thresholds: of extraction and matching.
       noise: of the scanner.
       **options: the remaining ones of `extract`.
+
+    Returns:
+      The sightings; those of lines that match no line of the map are not valid.
     """
     found = extract(scan, pose, thresholds=thresholds, noise=noise, **options)
     slot, nis = best_line(found.lines, lines, thresholds, "independent")
@@ -114,6 +117,9 @@ def residual_of_sighting(
       at: anchor of the line in the map.
       anchor: of the sighting, in the frame of the scanner.
       angle: of the sighting's normal, likewise.
+
+    Returns:
+      Offset in metres and angle in radians; zeros for a line seen where it is. Shape `[2]`.
     """
     seen = pose[:2] + rotate(pose[2], anchor)
     offset = line[0] + dot(unit(line[1]), at - seen)
@@ -132,6 +138,9 @@ def adjust(graph: PoseGraph, lines: Lines, sightings: LineSightings) -> Adjusted
       graph: keyframes, optimised. The first one is held.
       lines: of the map, near where the graph has them.
       sightings: of these lines from these keyframes.
+
+    Returns:
+      Poses, lines, and the covariances of both.
     """
     n, k = graph.poses.shape[0], lines.offset.shape[0]
     root = jnp.swapaxes(square_root(inverse(sightings.cov)), -1, -2)
@@ -225,6 +234,9 @@ def with_error_of_poses(
       seen: lines of which the covariance holds the poses' errors already.
       poses: of the keyframes. m, m, rad.
       cov_poses: of these.
+
+    Returns:
+      The map with larger covariances; its estimates do not change.
     """
 
     def nearest_pose(place: Float[Array, "2"]) -> tuple[Array, Array]:

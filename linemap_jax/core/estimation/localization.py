@@ -215,7 +215,15 @@ class Sightings:
 
 
 def believe(pose: Pose, line_map: LineMap) -> Belief:
-    """The belief to begin with: a pose that owes nothing to the map, and no opinion of how well the map fits."""
+    """The belief to begin with: a pose that owes nothing to the map, and no opinion of how well the map fits.
+
+    Args:
+      pose: of the robot, in the map.
+      line_map: the map, whose capacity decides the shape.
+
+    Returns:
+      The belief before the first scan.
+    """
     primitives = line_map.lines.valid.shape[0] + line_map.circles.valid.shape[0]
     dtype = pose.mean.dtype
     return Belief(
@@ -284,7 +292,17 @@ def localize(
 
 
 def predict(belief: Belief, step: Float[Array, "3"], extra: Float[Array, "3"], odometry: OdometryNoise) -> Belief:
-    """The belief after a step by the robot's odometry: what the map has done to the pose moves along."""
+    """The belief after a step by the robot's odometry: what the map has done to the pose moves along.
+
+    Args:
+      belief: before the step.
+      step: seen from the pose before, as the wheels count it. m, m, rad. Shape `[3]`.
+      extra: variances that come on top of those of the step. m^2, m^2, rad^2. Shape `[3]`.
+      odometry: noise of the wheels.
+
+    Returns:
+      The belief after the step.
+    """
     by_pose, by_step = jac_compose_pose(belief.mean, step), jac_compose_step(belief.mean, step)
     return dataclasses.replace(
         belief,
@@ -305,7 +323,21 @@ def observe(
     jacobians: Jacobians = "analytic",
     **options: Any,
 ) -> Seen:
-    """Lines, circles and points of a scan in the frame of the robot, whatever its pose."""
+    """Lines, circles and points of a scan in the frame of the robot, whatever its pose.
+
+    Args:
+      scan: `N` beams.
+      mount: of the scanner on the robot.
+      thresholds: criteria of the extraction.
+      noise: of the sensor.
+      capacity: slots for lines and circles.
+      rules: which reading of the method.
+      jacobians: "autodiff" or "analytic".
+      **options: the remaining ones of `extract`.
+
+    Returns:
+      What the scan holds; covariances are those of the measurement alone.
+    """
     dtype = scan.ranges.dtype
     here = Pose(mean=jnp.zeros(3, dtype), cov=jnp.zeros((3, 3), dtype))
     found = extract(
@@ -360,6 +392,9 @@ def locate(
       rules: which reading of the method.
       noise: of the sensor.
       settings: thresholds of the filter.
+
+    Returns:
+      The belief, with the pose improved and the map's part in it carried along; and what was used.
     """
     dtype = belief.mean.dtype
     cov = belief.cov
@@ -467,6 +502,9 @@ def sight_lines(
       thresholds: `match_...`.
       rules: which reading of the method.
       settings: the floors.
+
+    Returns:
+      A sighting for each line of the scan; not valid for those that match no line of the map.
     """
     new, jac = place(seen.lines, pose, cov)
     matches = match_lines(new, model, seen.collinear, thresholds, rules, "independent")
@@ -491,6 +529,9 @@ def place(lines: Lines, pose: Float[Array, "3"], cov: Float[Array, "3 3"]) -> tu
       lines: in the frame of the robot, with covariances of the measurement alone.
       pose: of the robot.
       cov: of the pose.
+
+    Returns:
+      The lines, with the pose error in `sqrt_persistent`; d(offset, angle) / d(x, y, theta), shape `[K, 2, 3]`.
     """
     lever = jax.vmap(lambda a: rotate(pose[2], a))(lines.anchor)
     angle = wrap_angle(lines.angle + pose[2])
@@ -509,6 +550,9 @@ def jac_line_pose(lines: Lines, lever: Float[Array, "K 2"]) -> Float[Array, "K 2
     Args:
       lines: in the world.
       lever: from the robot to their anchors, in the axes of the world, m.
+
+    Returns:
+      d(offset, angle) / d(x, y, theta). Shape `[K, 2, 3]`.
     """
     zero, one = jnp.zeros_like(lines.offset), jnp.ones_like(lines.offset)
     normal = lines.normal
@@ -528,6 +572,17 @@ def sight_circles(
 
     Circles that are not fitted describe what is visible of a cluster, which moves with the viewpoint by more than what
     there is to gain: they take part in the search alone.
+
+    Args:
+      seen: what the scan holds.
+      pose: from which it is taken to be seen. m, m, rad.
+      cov: of that pose. m^2, m rad, rad^2.
+      model: the circles of the map.
+      first: slot of the first circle among the sightings: the number of lines of the map.
+      settings: `match_nis` and `offset_floor`.
+
+    Returns:
+      A sighting for each circle of the scan; not valid for those that match none of the map.
     """
     circles = seen.circles
     lever = jax.vmap(lambda a: rotate(pose[2], a))(circles.center)
@@ -571,6 +626,9 @@ def sight_points(
       model: the lines of the map.
       noise: of the sensor.
       settings: `point_distance` and the floors.
+
+    Returns:
+      Sightings of lines of the map, by groups of points; not valid where there is no such group.
     """
     towards = jax.vmap(lambda a: rotate(pose[2], a))(seen.beams)
     points = pose[None, :2] + jax.vmap(lambda a: rotate(pose[2], a))(seen.points)
@@ -626,7 +684,15 @@ def _beside(
 
 
 def innovation_cov(belief: Belief, sightings: Sightings) -> Float[Array, "S 2 2"]:
-    """Covariance of each innovation by itself, H C H' + A A' + V and what pose and map have in common."""
+    """Covariance of each innovation by itself, H C H' + A A' + V and what pose and map have in common.
+
+    Args:
+      belief: predicted.
+      sightings: `S` of them.
+
+    Returns:
+      Of (offset, angle) of lines: m^2, m rad, rad^2; of the centres of circles: m^2. Shape `[S, 2, 2]`.
+    """
     moved = jnp.moveaxis(belief.by_map[:, sightings.slot], 0, 1)
     common = product(product(sightings.jac_pose, moved), jnp.swapaxes(sightings.by_map, -1, -2))
     of_pose = propagate(sightings.jac_pose, belief.cov)
@@ -634,7 +700,16 @@ def innovation_cov(belief: Belief, sightings: Sightings) -> Float[Array, "S 2 2"
 
 
 def gated(belief: Belief, sightings: Sightings, most: Number) -> Sightings:
-    """The sightings whose normalised innovation squared is less than `most`."""
+    """The sightings whose normalised innovation squared is less than `most`.
+
+    Args:
+      belief: predicted.
+      sightings: `S` of them.
+      most: the gate, a quantile of chi-square with 2 degrees of freedom.
+
+    Returns:
+      The sightings; those beyond the gate are not valid.
+    """
     nis = quadratic(sightings.innovation, inverse(innovation_cov(belief, sightings)))
     return _where(
         sightings.valid & (nis < most),
@@ -723,6 +798,16 @@ def fit_of_scan(
 
     What the map lacks makes returns nearer than it would have them, and speaks neither for nor against a pose. A return
     from behind a line that was seen often speaks against it.
+
+    Args:
+      seen: what the scan holds.
+      pose: of the robot, from which it is judged. m, m, rad.
+      lines: those of the map, directed.
+      field: of the map.
+      settings: `explained_distance` and `through_distance`.
+
+    Returns:
+      From -1, all of it contradicts, to 1, all of it is explained; 0 without a return.
     """
     points, valid = thinned(seen.points, seen.returned)
     ranges, _ = thinned(seen.ranges[:, None], seen.returned)

@@ -75,7 +75,16 @@ class Closure(NamedTuple):
 
 
 def joined(surfaces: Surface, poses: Float[Array, "S 3"], valid: Bool[Array, " S"]) -> Surface:
-    """Several surfaces in one frame, that in which the poses are given. `[S, M]` in, `[S * M]` out."""
+    """Several surfaces in one frame, that in which the poses are given. `[S, M]` in, `[S * M]` out.
+
+    Args:
+      surfaces: `S` of them, stacked, of `M` points each.
+      poses: of their frames. m, m, rad. Shape `[S, 3]`.
+      valid: which of them there are. Shape `[S]`.
+
+    Returns:
+      One surface of `S * M` points.
+    """
 
     def moved(surface: Surface, pose: Array, is_there: Array) -> Surface:
         surface = seen_from(surface, pose)
@@ -85,7 +94,7 @@ def joined(surfaces: Surface, poses: Float[Array, "S 3"], valid: Bool[Array, " S
 
 
 def thinned(surface: Surface) -> Surface:
-    """Every third point."""
+    """Every third point of the `surface`."""
     return jax.tree.map(lambda x: x[::THINNING], surface)
 
 
@@ -110,6 +119,9 @@ def close_loop(
       path: shortest path between the two, m.
       settings: what is believed.
       registration: of the keyframe.
+
+    Returns:
+      The step from the older keyframe to the new one, and whether it is believed.
     """
     surface = joined(surfaces, poses, valid)
     drift = settings.least_drift + settings.drift_per_metre * path

@@ -90,13 +90,16 @@ def cov_of_registration(
     prior: Float[Array, "*s 3 3"],
     error: RegistrationError = RegistrationError(),
 ) -> Float[Array, "*s 3 3"]:
-    """Covariance of a step that registration has found.
+    """Covariance of a step (x, y, theta) that registration has found: m^2, m rad, rad^2.
 
     Args:
-      information: of its points, as if their errors were independent.
+      information: of its points, as if their errors were independent: 1/m^2, 1/(m rad), 1/rad^2.
       share: of the scan's points, those that agree.
-      prior: what is known of the step without them, as information.
+      prior: what is known of the step without them, as information, likewise.
       error: how far they are believed.
+
+    Returns:
+      The covariance. Shape `[*s, 3, 3]`.
     """
     trust = jnp.clip((share - error.no_trust) / (error.full_trust - error.no_trust), 0, 1)
     weight = (error.point_weight * trust)[..., None, None]

@@ -127,6 +127,14 @@ def nearest(points: Float[Array, "M 2"], others: Float[Array, "K 2"], valid: Boo
     In float32, where the squared distances of two are equal but for their last bits, either of them. The bits of a
     positive number rise with it, so that index and distance fit into one integer, whose minimum is one kernel; an
     `argmin` goes number by number.
+
+    Args:
+      points: m. Shape `[M, 2]`.
+      others: m. Shape `[K, 2]`.
+      valid: which of the others count. Shape `[K]`.
+
+    Returns:
+      For each point the index of the nearest of the others. Shape `[M]`.
     """
     bits = (others.shape[0] - 1).bit_length()
     square = (points[None, :, 0] - others[:, None, 0]) ** 2 + (points[None, :, 1] - others[:, None, 1]) ** 2

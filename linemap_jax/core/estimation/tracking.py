@@ -85,7 +85,15 @@ class Tracked(NamedTuple):
 
 
 def begin_track(odometry: Float[Array, "3"], scan: Scan) -> Track:
-    """A track before its first scan. Shapes and dtype are those of the scan."""
+    """A track before its first scan. Shapes and dtype are those of the scan.
+
+    Args:
+      odometry: pose of the scanner by the robot's odometry at the first scan. m, m, rad. Shape `[3]`.
+      scan: the first scan, of which shape and dtype count.
+
+    Returns:
+      The state for `track`.
+    """
     blank = jax.eval_shape(surface_of_scan, scan)
     surface = jax.tree.map(lambda x: jnp.zeros((KEYFRAMES * x.shape[0], *x.shape[1:]), x.dtype), blank)
     zero = jnp.zeros(3, scan.ranges.dtype)
@@ -113,6 +121,9 @@ def track(
       noise: of the odometry.
       settings: keyframes, and trust in odometry.
       registration: of the scan.
+
+    Returns:
+      The state after the scan, and what there is to say of it.
     """
     counted = between(state.odometry, odometry)
     surface = surface_of_scan(scan)

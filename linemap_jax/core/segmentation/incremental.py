@@ -121,6 +121,9 @@ def follow(
       points: the points of the scan.
       gap: the largest distance between them, m, by the arc between their beams, m.
       beams: the largest angle between them, in beam spacings.
+
+    Returns:
+      Whether criterion 1 holds, and whether criterion 3 does. Shapes `[N]`.
     """
     step = points.position - one_before(points.position)
     arc = jnp.minimum(points.range, one_before(points.range)) * points.turn
@@ -129,12 +132,21 @@ def follow(
 
 
 def one_before(x: Shaped[Array, "N *s"]) -> Shaped[Array, "N *s"]:
-    """What stands before each; the first for the first."""
+    """What stands before each of `x`; the first for the first."""
     return jnp.concatenate([x[:1], x[:-1]])
 
 
 def gap_gate(arc: Float[Array, "*s"], thresholds: Thresholds, noise: SensorNoise) -> Float[Array, "*s"]:
-    """Criterion 1: the largest distance between successive points, in metres, by the arc between their beams."""
+    """Criterion 1: the largest distance between successive points, in metres, by the arc between their beams.
+
+    Args:
+      arc: between the beams of the two points, at the nearer one: range times angle, m.
+      thresholds: `gap_distance`, `gap_spacings`, `gap_sigmas`.
+      noise: of the range.
+
+    Returns:
+      The gate, m; of the shape of the arcs.
+    """
     noisy = thresholds.gap_sigmas * math.sqrt(2) * noise.range_sigma
     return jnp.maximum(jnp.maximum(thresholds.gap_distance, thresholds.gap_spacings * arc), noisy)
 

@@ -80,6 +80,9 @@ def segment(points: Points, thresholds: Thresholds, noise: SensorNoise, *, max_v
       noise: of the sensor.
       max_vertices: the largest number of vertices; None lets the criterion decide.
 
+    Returns:
+      The points, and which of them end runs.
+
     Raises:
       ValueError: at trace time, if the budget is not a whole number of two or more.
     """
@@ -108,6 +111,9 @@ def priced(
       follows: whether a line may hold a point and the one before.
       thresholds: `line_sigmas`.
       noise: of the sensor.
+
+    Returns:
+      The sweep, whose residuals count in sigmas; the price of a vertex, on the same scale.
     """
     angle, one = _angle(points), jnp.ones_like(points.range)
     sweep = Sweep(
@@ -240,7 +246,7 @@ def _by_budget(points: Points, noise: SensorNoise, max_vertices: int) -> Segment
 
 
 def budget_gap(arc: Float[Array, "*s"]) -> Float[Array, "*s"]:
-    """With a budget, the largest distance between successive points, m, by the arc between their beams."""
+    """With a budget, the largest distance between successive points, m, by the `arc` between their beams, m."""
     return jnp.maximum(BUDGET_GAP_DISTANCE, BUDGET_GAP_SPACINGS * arc)
 
 
@@ -316,6 +322,14 @@ def lines_of_polyline(lines: Lines, segmented: Segmented, pose: Pose) -> Lines:
     """The lines of the runs, laid through the vertices of the polyline.
 
     Their covariances remain those of the most likely lines of the same points.
+
+    Args:
+      lines: of the runs, from `measure_lines`.
+      segmented: by `segment` with a budget.
+      pose: of the robot.
+
+    Returns:
+      The lines with other offsets, angles and end points.
     """
     slot = jnp.minimum(jnp.arange(lines.valid.shape[0]), segmented.begin.shape[0] - 1)
     begin, end = segmented.begin[slot], segmented.end[slot]
@@ -337,7 +351,17 @@ def lines_of_polyline(lines: Lines, segmented: Segmented, pose: Pose) -> Lines:
 
 
 def join_corners(lines: Lines, runs: Runs, segmented: Segmented, pose: Pose) -> Lines:
-    """Let neighbouring lines end where they cross, if that is between the last beam of one and the other's first."""
+    """Let neighbouring lines end where they cross, if that is between the last beam of one and the other's first.
+
+    Args:
+      lines: of the runs, in the order of the sweep.
+      runs: their points.
+      segmented: by `segment`.
+      pose: of the robot.
+
+    Returns:
+      The lines with other end points.
+    """
     points = segmented.points
     count = lines.valid.shape[0]
     behind = jnp.minimum(jnp.arange(count) + 1, count - 1)

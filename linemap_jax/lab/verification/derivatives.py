@@ -66,7 +66,14 @@ class Agreement:
 
 
 def check_derivatives(seed: int = 0) -> list[Agreement]:
-    """Hold every derivative of the registry against the others, in float64, on random and on nasty inputs."""
+    """Hold every derivative of the registry against the others, in float64, on random and on nasty inputs.
+
+    Args:
+      seed: of the random inputs.
+
+    Returns:
+      How far each derivative is from the others, for each case.
+    """
     with jax.enable_x64(True):
         return [found for entry in DERIVATIVES for found in check(entry, np.random.default_rng(seed))]
 
