@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from linemap_jax.core import circles, fusion, likelihood, lines, matching, runs, sensor
 from linemap_jax.core.estimation import pose_filter
+from linemap_jax.core.fields import documented
 from linemap_jax.core.segmentation import incremental
 from linemap_jax.core.settings import PAPER_RULES, PAPER_THRESHOLDS, SensorNoise, Thresholds
 from linemap_jax.lab.verification import cases, derivatives, literals
@@ -29,13 +30,17 @@ CENTRAL = 1e-6
 """Largest difference from central differences."""
 
 
+@documented
 @dataclasses.dataclass(frozen=True)
 class Check:
     """One number that was computed, and what it is held against."""
 
     what: str
+    """What was computed."""
     value: float
+    """The number."""
     limit: float = EXACT
+    """The most that it may be."""
     differs: bool = False
     """The formula as printed, or where its assumption fails: the value must be more than the limit."""
 
@@ -45,16 +50,23 @@ class Check:
         return bool(self.value > self.limit if self.differs else self.value <= self.limit)
 
 
+@documented
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Row:
     """What there is to say of one equation. Its first check is the one to show."""
 
     equation: str
+    """Its number, or the section that is meant."""
     title: str
+    """What it is."""
     where: tuple[Callable[..., Any], ...]
+    """The functions of `core` that compute it."""
     verdict: Verdict
+    """Whether it holds as printed, and always."""
     sentence: str
+    """Why."""
     checks: tuple[Check, ...]
+    """What was computed to show it."""
 
     @property
     def passed(self) -> bool:
