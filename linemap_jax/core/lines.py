@@ -102,6 +102,8 @@ def regress(position: Float[Array, "N 2"], runs: Runs) -> Regression:
 def line_from_regression(fit: Regression, anchor: Float[Array, "K 2"]) -> Float[Array, "2 K"]:
     """Offset and angle of each line at an anchor: Eqs. (9)-(10) with the anchor for an origin.
 
+    These are the functions of the regression that Eqs. (13)-(14) mean.
+
     Departures from the paper: no absolute value in Eq. (9), since the offset is signed; the four-quadrant arctangent
     for Eq. (10), which is undefined as printed for a line through the origin.
 
@@ -122,6 +124,8 @@ def jac_line_points(
     position: Float[Array, "N 2"], runs: Runs, anchor: Float[Array, "K 2"], *, jacobians: Jacobians
 ) -> Float[Array, "N 2 2"]:
     """d(offset, angle) of each point's line / d(x, y) of the point; zero for points of no line.
+
+    The line is that function of its points of which Eq. (11) speaks.
 
     Args:
       position: the points, in metres. Shape `[N, 2]`.

@@ -199,7 +199,7 @@ def match_lines(
     rules: Rules,
     pose_error: PoseError,
 ) -> LineMatches:
-    """Find for each new line the line of the map that it is: section 5.1.1.
+    """Find for each new line the line of the map that it is: section 5.1.1, with the gate of Eq. (22).
 
     A scan that sees two parallel lines knows that they are two, however uncertain its pose is. Not in the paper: of
     several new lines that are next to the same line of the map, only those match it that are collinear with the best;

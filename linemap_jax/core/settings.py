@@ -46,8 +46,8 @@ class Thresholds:
     """[d_critc] Largest distance of a new point from the centre of its cluster, m; also the largest radius of a fitted
     circle."""
     circle_line_distance: Number = 0.1
-    """Circles whose centre is closer than this to a line are not modelled, m (s4.3.1): five sigma of a range of 2 cm,
-    since it is the noise of the line that is meant. `paper`: 0.15."""
+    """Circles whose centre is closer than this to a line are not modelled, m (s4.3.1, circles): five sigma of a range
+    of 2 cm, since it is the noise of the line that is meant. `paper`: 0.15."""
     match_angle: Number = 0.05
     """[delta theta_crit] Largest difference of direction of matching lines, rad. `paper`: 0.175 (10 degrees)."""
     match_distance: Number = 0.05

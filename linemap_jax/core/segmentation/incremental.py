@@ -1,4 +1,4 @@
-"""Section 4.3.1: the paper's three criteria, one pass over the points.
+"""Section 4.3.1 (lines): the paper's three criteria, one pass over the points.
 
 A point joins the current run while (1) it is near the previous point, (2) it is near the run's line and (3) its bearing
 is near the previous one. The running sums of Eq. (5) start anew at each run's first point: in coordinates of the world

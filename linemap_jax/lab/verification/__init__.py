@@ -6,12 +6,15 @@ The modules in their order:
   cases           inputs on which formulas for lines break
   derivatives     what holds the derivatives against one another
   sample          walls seen in one scan, through the pipeline
-  equations       a row for each equation: `verify`
+  rows            what a row of the table consists of
+  sections        a row for each section that says in words what is computed
+  equations       a row for each equation, and all rows: `verify`
   tables          the rows as tables, and which parts of `core` cite which equation
 """
 
 from linemap_jax.lab.verification.derivatives import DERIVATIVES, Agreement, Derivative, check_derivatives
-from linemap_jax.lab.verification.equations import Check, Row, verify
+from linemap_jax.lab.verification.equations import verify
+from linemap_jax.lab.verification.rows import Check, Row
 from linemap_jax.lab.verification.tables import as_dict, as_markdown, as_text, citations
 
 __all__ = [

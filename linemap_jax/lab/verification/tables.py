@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 import linemap_jax.core
-from linemap_jax.lab.verification.equations import Check, Row
+from linemap_jax.lab.verification.rows import Check, Row
 
 CORE = linemap_jax.core.__name__
 
