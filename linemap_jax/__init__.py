@@ -1,7 +1,31 @@
 """Maps of line segments and circles from 2D range scans, with covariances that can be believed.
 
-The names below stand in the order of the pipeline. Files and pictures are in `linemap_jax.io`, experiments in
-`linemap_jax.lab`; importing this module loads neither.
+The method of J. Vandorpe, H. Van Brussel and H. Xu, *Exact Dynamic Map Building for a Mobile Robot using Geometrical
+Primitives Produced by a 2D Range Finder*, ICRA 1996, pp. 901-908. In the order in which data flows:
+
+  Scan.from_ranges       one range scan, masked
+  Pose                   where the robot was, and how surely
+  Thresholds, SensorNoise, Mount, Rules, Capacity, preset
+                         the choices: `default`, or the paper to the letter
+  extract                scan and pose -> Extraction: the lines and circles of this scan
+  rho_theta              the paper's view of lines, for display and export
+  empty_map, update      one scan into a LineMap, with a Report of what it did
+  build, build_chunks    a whole log
+
+All of it is pure functions of arrays in metres and radians, counter-clockwise, for `jit`, `vmap` and `grad`.
+
+>>> import numpy as np
+>>> from linemap_jax import Pose, Scan, empty_map, update
+>>> bearings = np.radians(np.arange(-90.0, 90.5, 0.5))
+>>> scan = Scan.from_ranges(2 / np.maximum(np.cos(bearings), 0.5), bearings, range_max=4.0)  # a wall 2 m ahead
+>>> pose = Pose(mean=[0.0, 0.0, 0.0], cov=np.diag([0.05, 0.05, 0.01]) ** 2)
+>>> line_map, report = update(empty_map(), scan, pose)
+>>> print(f"{report.added} line, {line_map.lines.length[0]:.1f} m long")
+1 line, 6.8 m long
+
+`help` of each tells its shapes and units. What they are made of is in `linemap_jax.core`, SLAM in `linemap_jax.slam`,
+experiments in `linemap_jax.lab`, files and pictures in `linemap_jax.io`; importing this module loads none of the last
+three. `linemap verify` checks the paper equation by equation; `linemap --help` lists all commands.
 """
 
 import os

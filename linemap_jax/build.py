@@ -209,6 +209,12 @@ def _grow_scan(capacity: Capacity, full: Status) -> Capacity:
 def join_reports(reports: list[Report]) -> Report:
     """The reports of several pieces as one. Pieces may differ in how many primitives a scan may hold.
 
+    Args:
+      reports: of successive pieces of a log, each with one scan or more in front.
+
+    Returns:
+      One report, with the scans of all pieces in their order.
+
     Raises:
       ValueError: if there is none.
     """

@@ -25,6 +25,7 @@ from linemap_jax.core.estimation.pose_graph import SURE, Closures, PoseGraph, co
 from linemap_jax.core.estimation.registration import RegistrationSettings
 from linemap_jax.core.estimation.surface import Surface, middle_of
 from linemap_jax.core.estimation.tracking import Track, Tracked, TrackingSettings, begin_track, track_chunk
+from linemap_jax.core.fields import documented
 from linemap_jax.core.frames_on_host import between, compose
 from linemap_jax.core.settings import SensorNoise, Thresholds
 from linemap_jax.core.state import LineMap, Lines, Pose, Scan, pad_stack
@@ -194,7 +195,14 @@ class Slam:
         self._weight = np.asarray(graph.closures.weight)[: len(self._closures)]
 
     def graph(self, room: Callable[[int], int] | None = None) -> PoseGraph:
-        """Keyframes and closures, padded: to powers of two, or to what `room` gives for their number."""
+        """Keyframes and closures, padded: to powers of two, or to what `room` gives for their number.
+
+        Args:
+          room: how many slots for so many keyframes or closures; a power of two unless given.
+
+        Returns:
+          The graph.
+        """
         kept, count = self._keyframes, len(self._poses)
         n = (room or _room)(count)
         e = (room or _room)(len(self._closures))
@@ -300,6 +308,12 @@ class Slam:
         """Covariances of these, from those of the keyframes; m^2, m rad, rad^2.
 
         A scan between two keyframes errs as the one before it, and by its own registration.
+
+        Args:
+          cov_keyframes: of their poses, from `adjust`: m^2, m rad, rad^2. Shape `[N, 3, 3]`.
+
+        Returns:
+          Shape `[T, 3, 3]`.
         """
         owner, seen = np.concatenate(self._keyframe_of_scan), np.concatenate(self._seen_from_keyframe)
         theta = self._poses[owner, 2]
@@ -311,13 +325,18 @@ class Slam:
         return jac @ cov_keyframes[owner] @ np.swapaxes(jac, 1, 2) + own
 
 
+@documented
 class Slammed(NamedTuple):
     """A log whose poses were not known."""
 
     line_map: LineMap
-    trajectory: Float[np.ndarray, "T 3"]  # of the scanner at each scan. m, m, rad
-    cov: Float[np.ndarray, "T 3 3"]  # of these
+    """The map."""
+    trajectory: Float[np.ndarray, "T 3"]
+    """Poses of the scanner at each scan. m, m, rad."""
+    cov: Float[np.ndarray, "T 3 3"]
+    """Covariances of these: m^2, m rad, rad^2."""
     state: Slam
+    """From which it can go on."""
 
 
 def slam(
@@ -336,6 +355,12 @@ def slam(
       thresholds: of the map.
       noise: of the scanner.
       **settings: those of `Slam`.
+
+    Returns:
+      The map, the trajectory with its covariances, and the state, from which it can go on.
+
+    Raises:
+      TypeError: for a setting that `Slam` does not have.
     """
     state, count, places = Slam(**settings), scans.ranges.shape[0], np.asarray(odometry)
     for i in range(0, count, CHUNK):

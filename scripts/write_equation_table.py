@@ -5,8 +5,9 @@ Usage: python scripts/write_equation_table.py [--write]
 With --write the tables go into README, between their markers, provided that every check has passed.
 """
 
+import ast
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from readme import write_part
@@ -14,7 +15,7 @@ from readme import write_part
 from linemap_jax.lab.verification import Row, as_markdown, as_text, citations, verify
 
 ROOT = Path(__file__).resolve().parents[1]
-OF_ALL = "tests/lab/test_verification.py"
+OF_ALL = "test_verification::test_equation"
 
 
 def main() -> int:
@@ -32,17 +33,36 @@ def main() -> int:
 def part_of_readme(rows: Iterable[Row]) -> str:
     """What stands between the markers: the equations, and below them who cites them and where that is tested."""
     lines = [as_markdown(rows), "", "<details><summary>Equation, functions that cite it, tests of these</summary>", ""]
-    lines += ["| equation | cited in | tested in |", "| --- | --- | --- |"]
+    lines += ["| equation | cited in | tested by |", "| --- | --- | --- |"]
     for number, names in citations().items():
-        tests = sorted({test for name in names if (ROOT / (test := test_of(name))).exists()})
-        cited, tested = (", ".join(f"`{x}`" for x in several) for several in (names, [*tests, OF_ALL]))
+        tests = sorted({test for name in names for test in tests_of(name)})
+        cited, tested = (", ".join(f"`{x}`" for x in several) for several in (names, [*tests, f"{OF_ALL}[{number}]"]))
         lines.append(f"| ({number}) | {cited} | {tested} |")
     return "\n".join([*lines, "", "</details>"])
 
 
-def test_of(name: str) -> str:
-    """The test file of what has this name in `core`, whose parts the tests mirror."""
-    return f"tests/core/test_{name.split('.')[0]}.py"
+def tests_of(name: str) -> Iterator[str]:
+    """File and name of each test that names what has this name in `core`, whose modules the tests mirror.
+
+    Or that names what the file makes of it outside of any function, such as the same function compiled.
+    """
+    module, *_, function = name.split(".")
+    file = ROOT / f"tests/core/test_{module}.py"
+    body = ast.parse(file.read_text(encoding="utf-8")).body if file.exists() else []
+    meant = {function}
+    for item in body:
+        if isinstance(item, ast.Assign) and meant & names_in(item.value):
+            meant |= names_in(*item.targets)
+    for item in body:
+        if isinstance(item, ast.FunctionDef) and item.name.startswith("test_") and meant & names_in(item):
+            yield f"{file.stem}::{item.name}"
+
+
+def names_in(*nodes: ast.AST) -> set[str]:
+    """All names and attributes in pieces of a program."""
+    parts = [part for node in nodes for part in ast.walk(node)]
+    names = {part.id for part in parts if isinstance(part, ast.Name)}
+    return names | {part.attr for part in parts if isinstance(part, ast.Attribute)}
 
 
 if __name__ == "__main__":

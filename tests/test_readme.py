@@ -34,6 +34,9 @@ def table_below(heading: str, text: str = README) -> dict[str, list[str]]:
 def test_the_python_runs_as_a_user_would_run_it(tmp_path):
     code = "\n".join(re.findall(r"^```python\n(.*?)^```", README, re.MULTILINE | re.DOTALL))
     assert "build_chunks" in code
+    code += (
+        "\nimport doctest, linemap_jax\nassert doctest.testmod(linemap_jax) == (0, 7)"  # help(linemap_jax), likewise
+    )
     demo = resources.files("linemap_jax.io").joinpath("data", "demo.log.gz")
     (tmp_path / "my.log.gz").write_bytes(demo.read_bytes())
     # Of the cache see [tool.pytest.ini_options] in pyproject.toml.

@@ -11,6 +11,12 @@ def largest_of_batch(choice: Int[Array, ""]) -> Int[Array, ""]:
 
     `vmap` turns a `lax.switch` into all of its branches, since each item may go its own way. Where a later branch does
     all that an earlier one does, and more, the items may go one way together, and the others are left out.
+
+    Args:
+      choice: which branch an item of the batch needs, the later ones doing more.
+
+    Returns:
+      The same number, or that of the whole batch.
     """
     return choice
 

@@ -1,4 +1,6 @@
-"""Section 4.3: from the points that no line took to circles, Eqs. (18)-(20), and to fitted poles.
+"""Section 4.3 (circles): from the points that no line took to circles, Eqs. (18)-(20), and to fitted poles.
+
+The paper numbers 4.3 and 4.3.1 twice, for the extraction of lines and for that of circles.
 
 Eqs. (18)-(20) describe the visible arc of a pole: the centroid lies before its centre, the radius is about 0.6 of the
 pole's, and both move with the viewpoint. Where there are points enough the default takes the most likely circle
@@ -47,7 +49,7 @@ class _Cluster(NamedTuple):
 def cluster(
     points: Points, free: Bool[Array, " N"], thresholds: Thresholds
 ) -> tuple[Bool[Array, " N"], Float[Array, " N"]]:
-    """Section 4.3.1: consecutive points that no line took, each near the centre of those before it.
+    """Section 4.3.1 (circles): consecutive points that no line took, each near the centre of those before it.
 
     Args:
       points: the points of the scan.
@@ -107,6 +109,12 @@ def jac_arc_points(position: Float[Array, "N 2"], clusters: Runs, *, jacobians: 
       position: the points, in metres. Shape `[N, 2]`.
       clusters: which points belong together, at least two in each.
       jacobians: "autodiff": three reverse passes through the estimate; "analytic": derived by hand.
+
+    Returns:
+      Derivatives without unit. Shape `[N, 3, 2]`.
+
+    Raises:
+      ValueError: at trace time, if `jacobians` is neither.
     """
     if jacobians == "autodiff":
         arcs, pull_back = jax.vjp(lambda x: arcs_from_points(x, clusters), position)
@@ -376,9 +384,17 @@ def _truncated(margin: Float[Array, " N"], sigma: Float[Array, " N"]) -> tuple[F
 
 
 def near_lines(circles: Circles, lines: Lines, thresholds: Thresholds) -> Bool[Array, " C"]:
-    """Section 4.3.1: which circles lie too close to a line to be modelled; they are probably its noise.
+    """Section 4.3.1 (circles): which of them lie too close to a line to be modelled; they are probably its noise.
 
     A fitted circle is a body, and is held against the line with its rim: the bent end of a wall has a centre behind it.
+
+    Args:
+      circles: `C` circles.
+      lines: `K` lines.
+      thresholds: `circle_line_distance`.
+
+    Returns:
+      Which circles are too close; false for free slots. Shape `[C]`.
     """
 
     def distance2(center: Float[Array, "2"], line: Lines) -> Float[Array, ""]:

@@ -41,7 +41,7 @@ def extract(
     segmentation: Segmentation = "incremental",
     max_vertices: int | None = None,
     covariance: Covariance = "exact",
-    jacobians: Jacobians = "autodiff",
+    jacobians: Jacobians = "analytic",
 ) -> Extraction:
     """Lines and circles of one scan, in the frame of the world, with covariances.
 
@@ -61,7 +61,7 @@ def extract(
       max_vertices: of "optimal": a budget of end points for the scan, 2 or more; a corner that two lines share counts
         once. The lines are then those of polylines, down to two points each, and have slots for all of the budget.
       covariance: "exact", to first order with the pose error that all points share, or "printed", Eq. (12).
-      jacobians: "autodiff" through the estimate, or "analytic", the hand-derived ones.
+      jacobians: "analytic", the hand-derived ones, or "autodiff" through the estimate; the results are the same.
 
     Returns:
       The primitives in `capacity` slots, in beam order. Between circles there may be free slots.
@@ -137,6 +137,13 @@ def usable(scan: Scan, pose: Pose) -> tuple[Scan, Pose, Bool[Array, ""]]:
     """A scan and a pose without anything that is not finite, and whether the pose was finite.
 
     What stands in a masked beam may be anything; a scan with a pose that is not finite loses all its beams.
+
+    Args:
+      scan: `N` beams.
+      pose: of the robot.
+
+    Returns:
+      The scan, the pose, and whether the pose was finite.
     """
     finite = jnp.all(jnp.isfinite(pose.mean)) & jnp.all(jnp.isfinite(pose.cov))
     valid = scan.valid & finite
@@ -158,7 +165,26 @@ def extract_points(
     covariance: Covariance,
     jacobians: Jacobians,
 ) -> Extraction:
-    """`extract`, from the points of the scan on."""
+    """`extract`, from the points of the scan on.
+
+    Args:
+      points: the points of the scan.
+      pose: of the robot, finite.
+      thresholds: criteria of the extraction, as arrays of the dtype of the scan.
+      noise: of the sensor, likewise.
+      capacity: as for `extract`, and so are the others.
+      rules: which reading of the method.
+      segmentation: how points are divided into lines.
+      max_vertices: of "optimal".
+      covariance: "exact" or "printed".
+      jacobians: "autodiff" or "analytic".
+
+    Returns:
+      What the points hold, in the frame of the world.
+
+    Raises:
+      ValueError: at trace time, for an option that does not exist.
+    """
     segmented, chosen = None, points.valid
     if segmentation == "optimal":
         segmented = optimal.segment(points, thresholds, noise, max_vertices=max_vertices)
@@ -232,11 +258,21 @@ def extract_points(
 def with_defaults(
     thresholds: Thresholds | None, noise: SensorNoise | None, mount: Mount | None, dtype: Any
 ) -> tuple[Thresholds, SensorNoise, Mount]:
-    """The settings as arrays of one dtype, the defaults where none are given."""
+    """The settings as arrays of one dtype, the defaults where none are given.
+
+    Args:
+      thresholds: `Thresholds()` unless given.
+      noise: `SensorNoise()` unless given.
+      mount: `Mount()` unless given.
+      dtype: of the scan.
+
+    Returns:
+      All three, as arrays of that dtype.
+    """
     settings = (thresholds or Thresholds(), noise or SensorNoise(), mount or Mount())
     return as_dtype(settings, dtype)
 
 
 def as_dtype(tree: Any, dtype: Any) -> Any:
-    """All numbers of a tree as arrays of one dtype: that of the scan, never a hidden default."""
+    """The pytree `tree` with all its numbers as arrays of the float type `dtype`."""
     return jax.tree.map(lambda x: jnp.asarray(x, dtype), tree)

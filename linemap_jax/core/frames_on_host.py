@@ -8,14 +8,14 @@ Floats = NDArray[np.float64]
 
 
 def compose(pose: ArrayLike, step: ArrayLike) -> Float[np.ndarray, "*s 3"]:
-    """The pose that is reached from a pose by a step seen from there, both x, y, theta. m, m, rad in (-pi, pi]."""
+    """The pose that is reached from `pose` by `step`, seen from there; all x, y, theta. m, m, rad in (-pi, pi]."""
     pose, step = np.asarray(pose, float), np.asarray(step, float)
     place = pose[..., :2] + _turned(pose[..., 2], step)
     return np.concatenate([place, _wrapped(pose[..., 2:] + step[..., 2:])], -1)
 
 
 def between(before: ArrayLike, after: ArrayLike) -> Float[np.ndarray, "*s 3"]:
-    """The step from one pose to another, seen from the first: `compose(before, step)` is `after`. m, m, rad."""
+    """The step from a pose `before` to `after`, seen from the first: `compose(before, step)` is `after`. m, m, rad."""
     before = np.asarray(before, float)
     move = np.asarray(after, float) - before
     return np.concatenate([_turned(-before[..., 2], move), _wrapped(move[..., 2:])], -1)

@@ -30,8 +30,11 @@ class Errors:
     """The error of an estimate of n numbers, in the two parts of `Lines` and `Circles`."""
 
     cov_independent: Float[Array, "*s n n"]
+    """Covariance of what no other scan shares."""
     sqrt_persistent: Float[Array, "*s n 3"]
+    """Square root of the covariance of what other scans may share."""
     times_detected: Int[Array, "*s"]
+    """How many scans have seen the primitive."""
 
 
 ErrorsT = TypeVar("ErrorsT", Errors, Lines, Circles)
@@ -100,6 +103,13 @@ def forget(primitives: ErrorsT, share: Number) -> ErrorsT:
 
     The whole covariance does not change. For what one scan has seen this brings in the share of the pose error that
     persists. For a map one scan later: of u[k] = a u[k+1] + sqrt(1 - a^2) w only a share of a^2 is still there.
+
+    Args:
+      primitives: lines or circles, or what else has errors in two parts.
+      share: of the persisting variance, from 0 to 1.
+
+    Returns:
+      The same estimates with the same covariance, otherwise divided.
     """
     return dataclasses.replace(
         primitives,
@@ -119,6 +129,9 @@ def at_first_angle(pieces: Lines, model: Lines, pose: Pose) -> Lines:
       pieces: what a scan observed. Those on which the pose error has no influence stay as they are.
       model: for each piece the line that it belongs to.
       pose: of the robot.
+
+    Returns:
+      The pieces, with another `sqrt_persistent`.
     """
     # Reversed, the normal of the first view points the other way.
     angle = model.first_angle + jnp.where(dot(unit(model.first_angle), pieces.normal) < 0, jnp.pi, 0)
@@ -254,6 +267,9 @@ def fuse_circles(model: Circles, new: Circles, matches: CircleMatches, rules: Ru
         nearest is taken).
       rules: `weigh_circles`.
       pose_error: its model.
+
+    Returns:
+      The circles of the map, those that were matched improved.
     """
     k = model.valid.shape[0]
     into = jnp.where(matches.slot < 0, k, matches.slot)

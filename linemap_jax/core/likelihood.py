@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from linemap_jax.core.fields import documented
 from linemap_jax.core.frames import dot, perp, unit, wrap_angle
 from linemap_jax.core.propagation import apply, inverse
 from linemap_jax.core.runs import Runs
@@ -26,12 +27,16 @@ SHALLOW = 0.02
 """Cosine of the incidence (89 degrees) beyond which a beam does not say where it meets a line."""
 
 
+@documented
 class Linearised(NamedTuple):
     """The likelihood around some lines. Constants of the step, whatever they were computed from."""
 
     normal: Float[Array, "K 2"]
+    """Unit normals of the lines at which u was linearised."""
     anchor: Float[Array, "K 2"]
-    rows: Float[Array, "N 2"]  # d(offset, angle) / d(u) of each point's line, weighted: C (1, -s) / variance
+    """Anchors of the lines, in the coordinates of the points, m."""
+    rows: Float[Array, "N 2"]
+    """d(offset, angle) / d(u) of each point's line, weighted: C (1, -s) / variance."""
 
 
 def linearise(
@@ -45,6 +50,9 @@ def linearise(
       anchor: of each line, in the coordinates of the points.
       line: offset and angle of each, to start from.
       noise: of the sensor.
+
+    Returns:
+      What `step` needs.
     """
     normal = unit(line[1])
     mine = runs.spread(jnp.concatenate([normal, anchor, line[0][:, None]], -1))
@@ -72,6 +80,9 @@ def step(position: Float[Array, "N 2"], runs: Runs, line: Float[Array, "2 K"], a
       runs: the lines that they belong to.
       line: offset and angle of each, where it was linearised.
       at: what `linearise` gives for it.
+
+    Returns:
+      Offsets in metres and angles in radians, in (-pi, pi]. Shape `[2, K]`.
     """
     mine = runs.spread(jnp.concatenate([at.normal, at.anchor, line[0][:, None]], -1))
     residual = dot(mine[:, :2], position - mine[:, 2:4]) - mine[:, 4]
@@ -92,6 +103,12 @@ def jac_step_points(
       line: offset and angle of each, where it was linearised.
       at: what `linearise` gives for it.
       jacobians: "autodiff": two reverse passes through the step; "analytic": derived by hand.
+
+    Returns:
+      Without unit, and rad/m. Shape `[N, 2, 2]`.
+
+    Raises:
+      ValueError: at trace time, if `jacobians` is neither.
     """
     if jacobians == "autodiff":
         _, pull_back = jax.vjp(lambda x: step(x, runs, line, at), position)

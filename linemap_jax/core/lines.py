@@ -44,12 +44,19 @@ class Regression:
     """
 
     count: Float[Array, " K"]
-    origin: Float[Array, "K 2"]  # m, the first point
-    centroid: Float[Array, "K 2"]  # m, from the first point
+    """Number of points."""
+    origin: Float[Array, "K 2"]
+    """The first point, m."""
+    centroid: Float[Array, "K 2"]
+    """Mean of the points, from the first point, m."""
     steep: Bool[Array, " K"]
-    width: Float[Array, " K"]  # N_1 or N_2 of Eq. (6), m^2
+    """Whether x was regressed on y, (s, t), else y on x, (m, q)."""
+    width: Float[Array, " K"]
+    """N_1 or N_2 of Eq. (6), m^2."""
     slope: Float[Array, " K"]
-    direction: Float[Array, "K 2"]  # along the line, from the first point towards the last; not normalised
+    """m of Eq. (7), or s of Eq. (8)."""
+    direction: Float[Array, "K 2"]
+    """Along the line, from the first point towards the last; not normalised."""
 
 
 def regress(position: Float[Array, "N 2"], runs: Runs) -> Regression:
@@ -60,6 +67,9 @@ def regress(position: Float[Array, "N 2"], runs: Runs) -> Regression:
     Args:
       position: the points, in metres. Shape `[N, 2]`.
       runs: which points belong together.
+
+    Returns:
+      A fit for each run; of a free slot it means nothing, and is finite.
     """
     # The origin is a constant of the sums, not a variable of the estimate: shifting all sums changes no line.
     origin = jax.lax.stop_gradient(position[runs.first])
@@ -92,6 +102,8 @@ def regress(position: Float[Array, "N 2"], runs: Runs) -> Regression:
 def line_from_regression(fit: Regression, anchor: Float[Array, "K 2"]) -> Float[Array, "2 K"]:
     """Offset and angle of each line at an anchor: Eqs. (9)-(10) with the anchor for an origin.
 
+    These are the functions of the regression that Eqs. (13)-(14) mean.
+
     Departures from the paper: no absolute value in Eq. (9), since the offset is signed; the four-quadrant arctangent
     for Eq. (10), which is undefined as printed for a line through the origin.
 
@@ -113,11 +125,19 @@ def jac_line_points(
 ) -> Float[Array, "N 2 2"]:
     """d(offset, angle) of each point's line / d(x, y) of the point; zero for points of no line.
 
+    The line is that function of its points of which Eq. (11) speaks.
+
     Args:
       position: the points, in metres. Shape `[N, 2]`.
       runs: the lines that they belong to.
       anchor: of each line, held fixed. Shape `[K, 2]`.
       jacobians: "autodiff": two reverse passes through the estimate; "analytic": H J by the paper's way.
+
+    Returns:
+      H J, without unit, and rad/m. Shape `[N, 2, 2]`.
+
+    Raises:
+      ValueError: at trace time, if `jacobians` is neither.
     """
     if jacobians == "autodiff":
         _, pull_back = jax.vjp(lambda x: line_from_regression(regress(x, runs), anchor), position)
@@ -135,7 +155,17 @@ def jac_line_points(
 def jac_regression_points(
     position: Float[Array, "N 2"], runs: Runs, fit: Regression, anchor: Float[Array, "K 2"]
 ) -> Float[Array, "N 2 2"]:
-    """J of Eq. (12), derived by hand: d(m, q) / d(x, y), or d(s, t) / d(x, y), with the intercept at the anchor."""
+    """J of Eq. (12), derived by hand: d(m, q) / d(x, y), or d(s, t) / d(x, y), with the intercept at the anchor.
+
+    Args:
+      position: the points, in metres. Shape `[N, 2]`.
+      runs: the lines that they belong to.
+      fit: `regress` of both.
+      anchor: of each line, held fixed, m. Shape `[K, 2]`.
+
+    Returns:
+      J of each point's line; 1/m, and without unit. Shape `[N, 2, 2]`.
+    """
     centre = fit.origin + fit.centroid
     columns = [x[:, None] for x in (fit.count, fit.width, fit.slope, fit.steep.astype(anchor.dtype))]
     mine = runs.spread(jnp.concatenate([*columns, centre, centre - anchor], -1))
@@ -163,6 +193,13 @@ def jac_line_regression(fit: Regression, anchor: Float[Array, "K 2"]) -> Float[A
     Departures from the paper, whose print is wrong: the labels of the off-diagonal elements of H are swapped in
     (16)-(17); the sign that |.| of Eq. (9) takes away is kept; the (s, t) case has its own H, with
     d(angle)/ds = -1/(1 + s^2).
+
+    Args:
+      fit: the regressions.
+      anchor: of each line, held fixed, m. Shape `[K, 2]`.
+
+    Returns:
+      H of each line; m, without unit, and rad, rad/m. Shape `[K, 2, 2]`.
     """
     a = fit.slope
     norm2 = 1 + a * a
@@ -207,6 +244,9 @@ def measure_lines(
 
     Returns:
       The lines in the world; P, shape `[K, 2, 3]`; M, shape `[K, 2, 2]`, both for (offset, angle).
+
+    Raises:
+      ValueError: at trace time, for a `covariance` or `jacobians` that does not exist.
     """
     fit = regress(points.position, runs)
     robot = pose.mean[None, :2]
@@ -252,7 +292,17 @@ def measure_lines(
 def line_extent(
     position: Float[Array, "N 2"], runs: Runs, anchor: Float[Array, "K 2"], angle: Float[Array, " K"]
 ) -> Float[Array, "K 2"]:
-    """Section 4.2.4: the first and the last point of each run, projected on its line; metres from the anchor."""
+    """Section 4.2.4: the first and the last point of each run, projected on its line; metres from the anchor.
+
+    Args:
+      position: the points, in metres. Shape `[N, 2]`.
+      runs: the lines that they belong to.
+      anchor: of each line, in the coordinates of the points, m. Shape `[K, 2]`.
+      angle: of each line's normal, rad. Shape `[K]`.
+
+    Returns:
+      Begin and end along the tangent, m. Shape `[K, 2]`.
+    """
     tangent = jnp.stack([-jnp.sin(angle), jnp.cos(angle)], -1)
     return jnp.stack([dot(tangent, position[i] - anchor) for i in (runs.first, runs.last)], -1)
 

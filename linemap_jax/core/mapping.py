@@ -50,7 +50,16 @@ from linemap_jax.core.state import (
 
 
 def empty_map(capacity: Capacity = Capacity(), dtype: jnp.dtype | type | None = None) -> LineMap:
-    """A map with free slots only. The dtype is jax's default unless given; it should be that of the scans."""
+    """A map with free slots only. The dtype is jax's default unless given; it should be that of the scans.
+
+    Args:
+      capacity: slots for lines and circles. What finds no free slot is left out, and the status of `update` tells;
+        `build` makes room by itself.
+      dtype: of all numbers, that of the scans to come; jax's default unless given.
+
+    Returns:
+      The map, with free slots only.
+    """
     return LineMap(lines=empty_lines(capacity.lines, dtype), circles=empty_circles(capacity.circles, dtype))
 
 
@@ -73,7 +82,7 @@ def update(
     segmentation: Segmentation = "incremental",
     max_vertices: int | None = None,
     covariance: Covariance = "exact",
-    jacobians: Jacobians = "autodiff",
+    jacobians: Jacobians = "analytic",
 ) -> tuple[LineMap, Report]:
     """Bring one scan into the map: extract, match, fuse or add, merge, wipe.
 
@@ -148,6 +157,9 @@ def integrate(
       lasting: what of the pose error persists, by `persistence_of`.
       pose_error: as for `update`.
       rules: which reading of the method.
+
+    Returns:
+      The map, and what the scan did to it.
     """
     if pose_error == "persistent":
         # A scan without returns is none, so that a chunk may be filled up with such.

@@ -24,14 +24,22 @@ OVERLAP_WEIGHT = 1e-3
 class LineComparison:
     """A new line held against one of the map. No batch axis."""
 
-    offset: Float[Array, ""]  # innovation, new minus map, at the anchor of the new line, m
-    angle: Float[Array, ""]  # innovation, rad
-    lever: Float[Array, ""]  # of the shift S that moves a small change of the map's line to that anchor, m
-    sign: Float[Array, ""]  # -1 where the new line has to be taken reversed
-    nis: Float[Array, ""]  # Eq. (21)
-    gap: Float[Array, ""]  # m, along the line; negative where the segments overlap
-    collinear: Bool[Array, ""]  # passes the angle gate and the end-point gate
-    geometric: Bool[Array, ""]  # is collinear, and passes the gap gate
+    offset: Float[Array, ""]
+    """Innovation of the offset, new minus map, at the anchor of the new line, m."""
+    angle: Float[Array, ""]
+    """Innovation of the angle, rad."""
+    lever: Float[Array, ""]
+    """Lever of the shift S that moves a small change of the map's line to that anchor, m."""
+    sign: Float[Array, ""]
+    """-1 where the new line has to be taken reversed."""
+    nis: Float[Array, ""]
+    """Normalised distance, Eq. (21)."""
+    gap: Float[Array, ""]
+    """Gap along the line, m; negative where the segments overlap."""
+    collinear: Bool[Array, ""]
+    """Whether it passes the angle gate and the end-point gate."""
+    geometric: Bool[Array, ""]
+    """Whether it is collinear, and passes the gap gate."""
 
 
 @partial(jax.jit, static_argnames="pose_error")  # so that it is traced once, not once for each of its seven uses
@@ -47,6 +55,9 @@ def compare_lines(new: Lines, model: Lines, thresholds: Thresholds, pose_error: 
       thresholds: `match_...`.
       pose_error: its model. "persistent": what persists is one error in both lines, and cancels as far as it moves
         both alike. Else the two are taken for independent, as Eq. (21) does.
+
+    Returns:
+      Innovation, normalised distance, gap, and which gates the pair passes. No batch axis.
     """
     turn = wrap_angle(new.angle - model.angle)
     reverse = jnp.abs(turn) > jnp.pi / 2
@@ -138,12 +149,12 @@ def best_line(
 
 
 def normal_variance(cov: Float[Array, "2 2"], along: Float[Array, "*s"]) -> Float[Array, "*s"]:
-    """Variance of a line's position along its normal, `along` metres from the anchor, m^2."""
+    """Variance of a line along its normal, m^2, at `along` metres from the anchor, from its covariance `cov`."""
     return cov[0, 0] - 2 * along * cov[0, 1] + along**2 * cov[1, 1]
 
 
 def with_sign(cov: Float[Array, "*s 2 2"], sign: Float[Array, "*s"]) -> Float[Array, "*s 2 2"]:
-    """Covariance of (sign offset, angle)."""
+    """Covariance of (sign offset, angle), from `cov`, that of (offset, angle), and a `sign` of 1 or -1."""
     one = jnp.ones_like(sign)
     return cov * jnp.stack([jnp.stack([one, sign], -1), jnp.stack([sign, one], -1)], -2)
 
@@ -152,16 +163,27 @@ def with_sign(cov: Float[Array, "*s 2 2"], sign: Float[Array, "*s"]) -> Float[Ar
 class LineMatches:
     """What matching says of each new line."""
 
-    slot: Int[Array, " L"]  # of the map, -1 for none
-    suspect: Int[Array, " L"]  # the line of the map that made a new line ambiguous, -1 for none
-    nis: Float[Array, " L"]  # of the best geometric candidate, before the statistical gate; 0 for none
-    compared: Bool[Array, " L"]  # there was a geometric candidate that was not another line's
+    slot: Int[Array, " L"]
+    """Slot in the map, -1 for none."""
+    suspect: Int[Array, " L"]
+    """The line of the map that made a new line ambiguous, -1 for none."""
+    nis: Float[Array, " L"]
+    """Normalised distance of the best geometric candidate, before the statistical gate; 0 for none."""
+    compared: Bool[Array, " L"]
+    """Whether there was a geometric candidate that was not another line's."""
 
 
 def compare_pieces(new: Lines, thresholds: Thresholds) -> LineComparison:
     """Hold the lines of a scan against each other, each with each: `[L, L]`.
 
     They share the pose: what its error adds to both is the same, and the sensor's noise alone tells them apart.
+
+    Args:
+      new: the `L` lines of a scan.
+      thresholds: `match_...`.
+
+    Returns:
+      All comparisons, stacked `[L, L]`.
     """
 
     def compare(a: Lines, b: Lines) -> LineComparison:
@@ -178,7 +200,7 @@ def match_lines(
     rules: Rules,
     pose_error: PoseError,
 ) -> LineMatches:
-    """Find for each new line the line of the map that it is: section 5.1.1.
+    """Find for each new line the line of the map that it is: section 5.1.1, with the gate of Eq. (22).
 
     A scan that sees two parallel lines knows that they are two, however uncertain its pose is. Not in the paper: of
     several new lines that are next to the same line of the map, only those match it that are collinear with the best;
@@ -191,6 +213,9 @@ def match_lines(
       thresholds: `match_...`.
       rules: `share_pose`, `leave_out_ambiguous`.
       pose_error: its model.
+
+    Returns:
+      For each new line its line of the map, or which one stands in its way.
     """
     slot, nis = best_line(new, model, thresholds, pose_error)
     compared = jnp.isfinite(nis)
@@ -240,11 +265,16 @@ def group_lines(pair: LineComparison, unmatched: Bool[Array, " L"], thresholds: 
 class CircleMatches:
     """What matching says of each new circle."""
 
-    slot: Int[Array, " C"]  # of the map, -1 for none
-    distance: Float[Array, " C"]  # m, to the centre of that circle
-    nis: Float[Array, " C"]  # of the nearest within the distance gate, before the statistical one; 0 for none
+    slot: Int[Array, " C"]
+    """Slot in the map, -1 for none."""
+    distance: Float[Array, " C"]
+    """Distance to the centre of that circle, m."""
+    nis: Float[Array, " C"]
+    """Normalised distance of the nearest within the distance gate, before the statistical one; 0 for none."""
     dof: Int[Array, " C"]
-    ambiguous: Bool[Array, " C"]  # near a circle, but not it
+    """Degrees of freedom of that: 3, or 0 where nothing was compared."""
+    ambiguous: Bool[Array, " C"]
+    """Whether it is near a circle, but not it."""
 
 
 def match_circles(
@@ -254,6 +284,16 @@ def match_circles(
 
     The nearest is taken. The paper's one criterion is the distance of the centres; fitted circles have a covariance,
     and by default must pass a chi-square gate on centre and radius too.
+
+    Args:
+      new: the `C` circles of a scan.
+      model: the `K` circles of the map.
+      thresholds: `circle_match_distance`, `circle_match_nis`.
+      rules: `weigh_circles`, `leave_out_ambiguous`.
+      pose_error: its model, as of `compare_lines`.
+
+    Returns:
+      For each new circle its circle of the map.
     """
     step = new.center[:, None] - model.center[None]
     near = new.valid[:, None] & model.valid[None]

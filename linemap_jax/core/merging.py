@@ -24,9 +24,12 @@ from linemap_jax.core.state import LineMap, Lines, SlotsT, pytree
 class MergeReport:
     """What became of the lines and circles of the other map, and how many were joined."""
 
-    lines_joined: Int[Array, ""]  # lines that are gone, since they are part of another one now
-    circles_joined: Int[Array, ""]  # circles of the other map that were fused into one of the map
-    circles_left_out: Int[Array, ""]  # circles of either map that contradict the other: too near to a circle or line
+    lines_joined: Int[Array, ""]
+    """Lines that are gone, since they are part of another one now."""
+    circles_joined: Int[Array, ""]
+    """Circles of the other map that were fused into one of the map."""
+    circles_left_out: Int[Array, ""]
+    """Circles of either map that contradict the other: too near to a circle or line."""
 
 
 @partial(jax.jit, static_argnames=("rules", "pose_error"))

@@ -12,13 +12,20 @@ from linemap_jax.core.state import pytree
 class Runs:
     """Runs of consecutive points, one after the other in `K` slots."""
 
-    first: Int[Array, " K"]  # the first point, 0 for a free slot
-    last: Int[Array, " K"]  # the last point, 0 for a free slot
+    first: Int[Array, " K"]
+    """The first point of each run, 0 for a free slot."""
+    last: Int[Array, " K"]
+    """The last point of each run, 0 for a free slot."""
     valid: Bool[Array, " K"]
-    of_point: Int[Array, " N"]  # slot of each point's run, -1 for none
+    """Which slots are in use."""
+    of_point: Int[Array, " N"]
+    """Slot of each point's run, -1 for none."""
 
     def sum(self, per_point: Float[Array, "N *s"]) -> Float[Array, "K *s"]:
-        """Sum over the points of each run, in one pass: each sum begins at the first point of its run."""
+        """Sum of `per_point` over the points of each run, in one pass: each begins at the first point of its run.
+
+        Zero for free slots.
+        """
         n = self.of_point.shape[0]
         rows = jnp.where((self.of_point >= 0)[:, None], per_point.reshape(n, -1), 0)
         begins = jnp.zeros(n, bool).at[self.first].set(True)
@@ -37,6 +44,10 @@ class Runs:
 
         Whole runs must be chosen, and no more than `size` points.
 
+        Args:
+          which: the points of the chosen runs. Shape `[N]`.
+          size: places for them.
+
         Returns:
           The index of each point, of any where there is none; the runs, in the same slots, those not chosen free.
         """
@@ -54,7 +65,7 @@ class Runs:
         return place, some
 
     def spread(self, per_run: Shaped[Array, "K *s"]) -> Shaped[Array, "N *s"]:
-        """The value of each point's run; something finite for points of no run."""
+        """The value of each point's run, out of `per_run`; something finite for points of no run."""
         return per_run[self.of_point]
 
 

@@ -22,19 +22,29 @@ class Points:
     Positions are relative to the robot's, in the axes of the world.
     """
 
-    position: Float[Array, "N 2"]  # m
-    beam: Float[Array, "N 2"]  # unit vector along the beam
-    range: Float[Array, " N"]  # m
-    turn: Float[Array, " N"]  # rad, angle to the beam of the point before, 0 for the first
-    valid: Bool[Array, " N"]  # true for the returns, which stand first
-    index: Int[Array, " N"]  # beam of the scan, `N` where there is no return
-    jac_pose: Float[Array, "N 2 3"]  # F of Eq. (4)
-    jac_measurement: Float[Array, "N 2 2"]  # G of Eq. (4), with respect to (range, bearing)
-    laser: Float[Array, "2"]  # m, the scanner
-    spacing: Float[Array, ""]  # rad, between neighbouring beams
+    position: Float[Array, "N 2"]
+    """Points in the axes of the world, from the robot's position, m."""
+    beam: Float[Array, "N 2"]
+    """Unit vector along the beam."""
+    range: Float[Array, " N"]
+    """Measured ranges, m."""
+    turn: Float[Array, " N"]
+    """Angle to the beam of the point before, 0 for the first, rad."""
+    valid: Bool[Array, " N"]
+    """True for the returns, which stand first."""
+    index: Int[Array, " N"]
+    """Beam of the scan, `N` where there is no return."""
+    jac_pose: Float[Array, "N 2 3"]
+    """F of Eq. (4), d(point) / d(pose)."""
+    jac_measurement: Float[Array, "N 2 2"]
+    """G of Eq. (4), with respect to (range, bearing)."""
+    laser: Float[Array, "2"]
+    """The scanner, from the robot's position, m."""
+    spacing: Float[Array, ""]
+    """Angle between neighbouring beams, rad."""
 
     def per_beam(self, value: Int[Array, " N"]) -> Int[Array, " N"]:
-        """A number of each point as one of each beam of the scan, -1 for beams without a return."""
+        """`value`, a number of each point, as one of each beam of the scan, -1 for beams without a return."""
         return jnp.full(value.shape, -1, value.dtype).at[self.index].set(value, mode="drop")
 
 
@@ -49,6 +59,9 @@ def point_from_measurement(
       pose: (x, y, theta) of the robot. m, m, rad.
       measurement: (range, bearing). m, rad.
       mount: (x, y, theta) of the scanner on the robot. m, m, rad.
+
+    Returns:
+      The point in the world, m. Shape `[2]`.
     """
     return pose[:2] + rotate(pose[2], mount[:2]) + measurement[0] * unit(pose[2] + mount[2] + measurement[1])
 
@@ -56,7 +69,16 @@ def point_from_measurement(
 def jac_point_pose(
     pose: Float[Array, "3"], measurement: Float[Array, "2"], mount: Float[Array, "3"]
 ) -> Float[Array, "2 3"]:
-    """F of Eq. (4), derived by hand: d(point) / d(x, y, theta). Arguments as in `point_from_measurement`."""
+    """F of Eq. (4), derived by hand: d(point) / d(x, y, theta).
+
+    Args:
+      pose: as in `point_from_measurement`.
+      measurement: as there.
+      mount: as there.
+
+    Returns:
+      Without unit, and m in the last column. Shape `[2, 3]`.
+    """
     c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
     cb, sb = jnp.cos(pose[2] + mount[2] + measurement[1]), jnp.sin(pose[2] + mount[2] + measurement[1])
     one, zero = jnp.ones_like(c), jnp.zeros_like(c)
@@ -68,14 +90,23 @@ def jac_point_pose(
 def jac_point_measurement(
     pose: Float[Array, "3"], measurement: Float[Array, "2"], mount: Float[Array, "3"]
 ) -> Float[Array, "2 2"]:
-    """G of Eq. (4), derived by hand: d(point) / d(range, bearing). Arguments as in `point_from_measurement`."""
+    """G of Eq. (4), derived by hand: d(point) / d(range, bearing).
+
+    Args:
+      pose: as in `point_from_measurement`.
+      measurement: as there.
+      mount: as there.
+
+    Returns:
+      Without unit, and m in the last column. Shape `[2, 2]`.
+    """
     angle = pose[2] + mount[2] + measurement[1]
     c, s = jnp.cos(angle), jnp.sin(angle)
     return jnp.stack([jnp.stack([c, -measurement[0] * s]), jnp.stack([s, measurement[0] * c])])
 
 
 def cov_measurement(noise: SensorNoise) -> Float[Array, "2 2"]:
-    """C_s of Eq. (4): range and bearing are not correlated."""
+    """C_s of Eq. (4), from the `noise` of the sensor: range and bearing are not correlated. m^2, rad^2."""
     return jnp.diag(jnp.stack([jnp.asarray(noise.range_sigma), jnp.asarray(noise.bearing_sigma)]) ** 2)
 
 
@@ -85,7 +116,17 @@ def cov_point(
     cov_pose: Float[Array, "3 3"],
     noise: SensorNoise,
 ) -> Float[Array, "*s 2 2"]:
-    """C_p of Eq. (4), from F and G, in m^2. It holds the pose error that all points of the scan share."""
+    """C_p of Eq. (4). It holds the pose error that all points of the scan share.
+
+    Args:
+      jac_pose: F of each point. Shape `[*s, 2, 3]`.
+      jac_measurement: G of each point. Shape `[*s, 2, 2]`.
+      cov_pose: of (x, y, theta): m^2, m rad, rad^2. Shape `[3, 3]`.
+      noise: of the sensor, m and rad.
+
+    Returns:
+      Of (x, y) of each point, m^2. Shape `[*s, 2, 2]`.
+    """
     return propagate(jac_pose, cov_pose) + propagate(jac_measurement, cov_measurement(noise))
 
 
@@ -97,6 +138,9 @@ def points_from_scan(scan: Scan, pose: Pose, mount: Mount, *, jacobians: Jacobia
       pose: of the robot, in the world.
       mount: of the scanner, on the robot.
       jacobians: "autodiff" or "analytic".
+
+    Returns:
+      `N` points; those that are not valid stand last.
     """
     # The position of the robot is left out: it adds nothing to the derivatives, and takes digits from the points.
     here = pose.mean.at[:2].set(0)

@@ -10,6 +10,7 @@ from typing import Any, Literal, NamedTuple
 
 from jaxtyping import Array, Float
 
+from linemap_jax.core.fields import documented
 from linemap_jax.core.state import positional_pytree, pytree
 
 Number = float | Float[Array, ""]
@@ -45,8 +46,8 @@ class Thresholds:
     """[d_critc] Largest distance of a new point from the centre of its cluster, m; also the largest radius of a fitted
     circle."""
     circle_line_distance: Number = 0.1
-    """Circles whose centre is closer than this to a line are not modelled, m (s4.3.1): five sigma of a range of 2 cm,
-    since it is the noise of the line that is meant. `paper`: 0.15."""
+    """Circles whose centre is closer than this to a line are not modelled, m (s4.3.1, circles): five sigma of a range
+    of 2 cm, since it is the noise of the line that is meant. `paper`: 0.15."""
     match_angle: Number = 0.05
     """[delta theta_crit] Largest difference of direction of matching lines, rad. `paper`: 0.175 (10 degrees)."""
     match_distance: Number = 0.05
@@ -113,6 +114,13 @@ class Persistence:
 def persistence_of(pose_error: PoseError, persistence: Persistence | None) -> Persistence:
     """What of a pose error persists under a model of it; where nothing is known, all of it may.
 
+    Args:
+      pose_error: "independent", "persistent" or "unknown".
+      persistence: the model of "persistent"; `Persistence()` unless given.
+
+    Returns:
+      What persists, and how long.
+
     Raises:
       ValueError: if there is no such model.
     """
@@ -123,17 +131,21 @@ def persistence_of(pose_error: PoseError, persistence: Persistence | None) -> Pe
     raise ValueError(f"pose_error must be 'independent', 'persistent' or 'unknown', not {pose_error!r}")
 
 
+@documented
 class Capacity(NamedTuple):
     """Number of slots: of a map, or of what one scan may hold. Static: it is part of the compiled shape."""
 
     lines: int = 256
+    """Slots for lines."""
     circles: int = 256
+    """Slots for circles."""
 
 
 SCAN_CAPACITY = Capacity(lines=32, circles=64)
 """Slots for what a single scan holds."""
 
 
+@documented
 @dataclasses.dataclass(frozen=True)
 class Rules:
     """Which reading of the method is meant. Static; every field is one departure from the paper, on by default."""
@@ -191,6 +203,12 @@ PAPER_RULES = Rules(**{field.name: False for field in dataclasses.fields(Rules)}
 
 def preset(name: Literal["default", "paper"]) -> dict[str, Any]:
     """The keyword arguments of `extract`, `update` and `build` that make up a preset.
+
+    Args:
+      name: "default" or "paper".
+
+    Returns:
+      A dictionary of `thresholds`, `rules` and `covariance`.
 
     Raises:
       ValueError: if there is no preset of that name.

@@ -21,20 +21,20 @@ from linemap_jax.core.state import DirectedLines, Lines, SlotsT, empty_circles, 
 
 
 def first_true(which: Bool[Array, " K"]) -> Int[Array, ""]:
-    """Index of the first true one; `K` if there is none."""
+    """Index of the first true one of `which`; `K` if there is none."""
     k = which.shape[0]
     return jnp.min(jnp.where(which, jnp.arange(k, dtype=jnp.int32), k))
 
 
 def all_true(which: Bool[Array, " N"], size: int) -> Int[Array, " M"]:
-    """Indices of the first `size` true ones, in order; `N` where there are no more."""
+    """Indices of the first `size` true ones of `which`, in order; `N` where there are no more."""
     n = which.shape[0]
     place = jnp.where(which, rank_of_true(which), size)
     return jnp.full(size, n, jnp.int32).at[place].set(jnp.arange(n, dtype=jnp.int32), mode="drop")
 
 
 def rank_of_true(which: Bool[Array, " N"]) -> Int[Array, " N"]:
-    """How many are true before each."""
+    """How many of `which` are true before each."""
 
     def step(count: Array, one: Array) -> tuple[Array, Array]:
         return count + one, count
@@ -43,7 +43,7 @@ def rank_of_true(which: Bool[Array, " N"]) -> Int[Array, " N"]:
 
 
 def latest_true(which: Bool[Array, " N"]) -> Int[Array, " N"]:
-    """Index of the last true one up to each; -1 where there is none."""
+    """Index of the last true one of `which` up to each; -1 where there is none."""
 
     def step(latest: Array, x: tuple[Array, Array]) -> tuple[Array, Array]:
         index, one = x
@@ -55,19 +55,19 @@ def latest_true(which: Bool[Array, " N"]) -> Int[Array, " N"]:
 
 
 def earliest_true(which: Bool[Array, " N"]) -> Int[Array, " N"]:
-    """Index of the first true one from each on; `N` where there is none."""
+    """Index of the first true one of `which` from each on; `N` where there is none."""
     return which.shape[0] - 1 - latest_true(which[::-1])[::-1]
 
 
 def least(score: Float[Array, "L K"]) -> tuple[Int[Array, " L"], Float[Array, " L"]]:
-    """Where in each row the least number stands, the first of equal ones, and that number."""
+    """Where in each row of `score` the least number stands, the first of equal ones, and that number."""
     value = jnp.min(score, -1)
     index = jnp.arange(score.shape[1], dtype=jnp.int32)[None]
     return jnp.min(jnp.where(score == value[:, None], index, score.shape[1] - 1), -1), value
 
 
 def free_slots(wanted: Bool[Array, " M"], taken: Bool[Array, " K"]) -> tuple[Int[Array, " M"], Bool[Array, ""]]:
-    """A free slot for each that wants one, the lowest first, -1 where there is none; and whether that happened."""
+    """A slot not `taken` for each that is `wanted`, lowest first, -1 where there is none; and whether that happened."""
     k = taken.shape[0]
     slot = all_true(~taken, wanted.shape[0])[rank_of_true(wanted)]
     fits = wanted & (slot < k)
@@ -83,6 +83,13 @@ def computed_once(function: Callable[[TreeT], Any], rows: TreeT) -> Any:
     XLA computes a number anew in each kernel that reads it, and in each cell of a kernel that holds all against all: of
     512 lines and 360 beams, 180 000 cosines instead of 872. It looks through `optimization_barrier`, but not into a
     loop. This one has two steps, since a loop of one would be none.
+
+    Args:
+      function: of one row, or of any number of them.
+      rows: a pytree of arrays, stacked.
+
+    Returns:
+      What the function gives for all rows.
     """
     count = jax.tree.leaves(rows)[0].shape[0]
     half = -(-count // 2)
@@ -98,13 +105,13 @@ def computed_once(function: Callable[[TreeT], Any], rows: TreeT) -> Any:
 
 
 def directed(lines: Lines) -> DirectedLines:
-    """Lines with their normals computed, once."""
+    """The `lines` with their normals computed, once."""
     fields = {field.name: getattr(lines, field.name) for field in dataclasses.fields(Lines)}
     return DirectedLines(**fields, unit_normal=computed_once(unit, lines.angle))
 
 
 def neutral_where_free(slots: SlotsT) -> SlotsT:
-    """The same lines or circles with neutral values in every free slot, so that nothing non-finite lurks there."""
+    """The same `slots` of lines or circles with neutral values in the free ones: nothing non-finite lurks there."""
     return choose(slots.valid, slots, _empty_like(slots, slots.valid.shape[0]))
 
 
@@ -114,13 +121,13 @@ def choose(first: Bool[Array, " K"], a: TreeT, b: TreeT) -> TreeT:
 
 
 def take(slots: SlotsT, index: Int[Array, "*s"]) -> SlotsT:
-    """The lines or circles in some slots; an index of -1 gives something finite that means nothing."""
+    """The lines or circles of `slots` at `index`; an index of -1 gives something finite that means nothing."""
     columns, back = _packed(slots)
     return back(columns[:, index], slots, lambda x: x[index])
 
 
 def put(slots: SlotsT, index: Int[Array, " M"], rows: SlotsT) -> SlotsT:
-    """Lines or circles written into some slots; an index of -1 writes nothing. No index but -1 may occur twice."""
+    """`slots` with lines or circles, `rows`, written at `index`; -1 writes nothing. No index but -1 may occur twice."""
     into = jnp.where(index < 0, slots.valid.shape[0], index)
     columns, back = _packed(slots)
     columns = columns.at[:, into].set(_packed(rows)[0], mode="drop")
@@ -159,6 +166,13 @@ def _packed(slots: SlotsT) -> tuple[Float[Array, "P K"], Callable[..., SlotsT]]:
 
 def resize(slots: SlotsT, capacity: int) -> SlotsT:
     """The same lines or circles with room for `capacity` of them; added slots are free.
+
+    Args:
+      slots: lines or circles.
+      capacity: slots that there shall be.
+
+    Returns:
+      The larger ones.
 
     Raises:
       ValueError: if `capacity` is smaller than the present one: primitives would be lost.

@@ -15,22 +15,39 @@ import numpy as np
 from jax import export
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
+from linemap_jax.core.fields import documented
 from linemap_jax.core.sweep import close_sweep
+
+T = TypeVar("T")
 
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
-def pytree(cls: type) -> Any:
-    """Register a class as a frozen, keyword-only dataclass that is a pytree of its fields."""
-    return _exportable(chex.dataclass(frozen=True, kw_only=True, mappable_dataclass=False)(cls))
+def pytree(cls: type[T]) -> type[T]:
+    """Register a class as a frozen, keyword-only dataclass that is a pytree of its fields.
+
+    Args:
+      cls: a class with annotated fields, each with a string below it that says what it means, and its unit.
+
+    Returns:
+      The dataclass; `help` shows its fields.
+    """
+    return documented(_exportable(chex.dataclass(frozen=True, kw_only=True, mappable_dataclass=False)(cls)))
 
 
 @dataclass_transform(frozen_default=True)
-def positional_pytree(cls: type) -> Any:
-    """The same, and its fields may be given by position."""
-    return _exportable(chex.dataclass(frozen=True, mappable_dataclass=False)(cls))
+def positional_pytree(cls: type[T]) -> type[T]:
+    """The same, and its fields may be given by position.
+
+    Args:
+      cls: as of `pytree`.
+
+    Returns:
+      The dataclass.
+    """
+    return documented(_exportable(chex.dataclass(frozen=True, mappable_dataclass=False)(cls)))
 
 
-def _exportable(cls: type) -> type:
+def _exportable(cls: type[T]) -> type[T]:
     """Let `jax.export` write down programs over the class; beside the fields, chex keeps their names."""
     export.register_pytree_node_serialization(
         cls,
@@ -82,11 +99,16 @@ class Scan:
     Make one with `Scan.from_ranges`, which masks what is not a return.
     """
 
-    ranges: Float[Array, " N"]  # m
-    bearings: Float[Array, " N"]  # rad
+    ranges: Float[Array, " N"]
+    """Ranges of the beams in the order of the sweep, m; 0 where there is no return."""
+    bearings: Float[Array, " N"]
+    """Angles of the beams in the frame of the sensor, counter-clockwise, rad."""
     valid: Bool[Array, " N"]
-    spacing: Float[Array, ""]  # rad, between neighbouring beams
-    first: Int[Array, ""]  # beam at which the sweep begins: 0, unless it closes on itself
+    """Which beams came back."""
+    spacing: Float[Array, ""]
+    """Angle between neighbouring beams, rad."""
+    first: Int[Array, ""]
+    """Beam at which the sweep begins: 0, unless it closes on itself."""
 
     @classmethod
     def from_ranges(
@@ -120,8 +142,11 @@ class Scan:
 class Pose:
     """The pose of the robot in the world, and its covariance."""
 
-    mean: Float[Array, "3"]  # x, y in m, theta in rad
-    cov: Float[Array, "3 3"]  # m^2, m rad, rad^2
+    mean: Float[Array, "3"]
+    """x, y in m, and theta, the direction in which the robot looks, counter-clockwise, in rad."""
+    cov: Float[Array, "3 3"]
+    """Covariance of (x, y, theta) in the axes of the world, not of the robot: m^2, m rad, rad^2. Symmetric and positive
+    semidefinite; zeros are an exact pose."""
 
     def __post_init__(self) -> None:
         """Lists of numbers become arrays."""
@@ -148,16 +173,26 @@ class Lines:
     same error would look as if it told the line's direction (Huang, Mourikis and Roumeliotis 2008).
     """
 
-    anchor: Float[Array, "K 2"]  # m, world
-    offset: Float[Array, " K"]  # m, along the normal
-    angle: Float[Array, " K"]  # rad, direction of the normal
-    cov_independent: Float[Array, "K 2 2"]  # of (offset, angle): m^2, m rad, rad^2; what no other scan shares
-    sqrt_persistent: Float[Array, "K 2 3"]  # square root of what other scans may share: m, rad
-    first_angle: Float[Array, " K"]  # rad, direction of the normal when the line was first seen
-    extent: Float[Array, "K 2"]  # m, begin and end along the tangent; begin <= end
-    var_extent: Float[Array, "K 2"]  # m^2, of the end points along the tangent
+    anchor: Float[Array, "K 2"]
+    """A point of the world near the middle of the segment, m."""
+    offset: Float[Array, " K"]
+    """How far the line lies from its anchor along the normal, m."""
+    angle: Float[Array, " K"]
+    """Direction of the normal, rad."""
+    cov_independent: Float[Array, "K 2 2"]
+    """Covariance of (offset, angle), of what no other scan shares: m^2, m rad, rad^2."""
+    sqrt_persistent: Float[Array, "K 2 3"]
+    """Square root of the covariance of (offset, angle), of what other scans may share: m, rad."""
+    first_angle: Float[Array, " K"]
+    """Direction of the normal when the line was first seen, rad."""
+    extent: Float[Array, "K 2"]
+    """Begin and end along the tangent, from the anchor, m; begin <= end."""
+    var_extent: Float[Array, "K 2"]
+    """Variances of the end points along the tangent, m^2."""
     times_detected: Int[Array, " K"]
+    """How many scans have seen the line."""
     valid: Bool[Array, " K"]
+    """Which slots are in use."""
 
     @property
     def cov(self) -> Float[Array, "K 2 2"]:
@@ -200,6 +235,7 @@ class DirectedLines(Lines):
     """Lines whose normals stand ready, for whoever holds many against many; see `slots.directed`."""
 
     unit_normal: Float[Array, "K 2"]
+    """Unit normals."""
 
     @property
     def normal(self) -> Float[Array, "K 2"]:
@@ -217,13 +253,20 @@ class Circles:
     with the viewpoint.
     """
 
-    center: Float[Array, "K 2"]  # m, world
-    radius: Float[Array, " K"]  # m
-    cov_independent: Float[Array, "K 3 3"]  # of (x, y, radius), m^2; what no other scan shares
-    sqrt_persistent: Float[Array, "K 3 3"]  # square root of what other scans may share, m
+    center: Float[Array, "K 2"]
+    """Centres in the world, m."""
+    radius: Float[Array, " K"]
+    """Radii, m."""
+    cov_independent: Float[Array, "K 3 3"]
+    """Covariance of (x, y, radius), of what no other scan shares, m^2."""
+    sqrt_persistent: Float[Array, "K 3 3"]
+    """Square root of the covariance of (x, y, radius), of what other scans may share, m."""
     fitted: Bool[Array, " K"]
+    """Whether the circle is a fitted pole; else it describes the points that were visible."""
     times_detected: Int[Array, " K"]
+    """How many scans have seen the circle."""
     valid: Bool[Array, " K"]
+    """Which slots are in use."""
 
     @property
     def cov(self) -> Float[Array, "K 3 3"]:
@@ -236,21 +279,31 @@ class LineMap:
     """A map of line segments and circles."""
 
     lines: Lines
+    """The line segments; `lines.valid` tells which slots are in use."""
     circles: Circles
+    """The circles, likewise."""
 
 
 @pytree
 class Rejected:
     """Points that were turned away, by criterion."""
 
-    invalid: Int[Array, ""]  # beams without a return
-    gap: Int[Array, ""]  # broke a run by criterion 1, distance to the previous point
-    distance: Int[Array, ""]  # broke a run by criterion 2, distance to the line
-    bearing: Int[Array, ""]  # broke a run by criterion 3, angle to the previous point
-    too_few: Int[Array, ""]  # lie in runs of fewer than three points that can be used
-    too_short: Int[Array, ""]  # lie in runs shorter than the shortest line
-    lone: Int[Array, ""]  # in no line and in no cluster
-    near_line: Int[Array, ""]  # lie in clusters too close to a line to be modelled
+    invalid: Int[Array, ""]
+    """Beams without a return."""
+    gap: Int[Array, ""]
+    """Points that broke a run by criterion 1, distance to the previous point."""
+    distance: Int[Array, ""]
+    """Points that broke a run by criterion 2, distance to the line."""
+    bearing: Int[Array, ""]
+    """Points that broke a run by criterion 3, angle to the previous point."""
+    too_few: Int[Array, ""]
+    """Points in runs of fewer than three points that can be used."""
+    too_short: Int[Array, ""]
+    """Points in runs shorter than the shortest line."""
+    lone: Int[Array, ""]
+    """Points in no line and in no cluster."""
+    near_line: Int[Array, ""]
+    """Points in clusters too close to a line to be modelled."""
 
 
 @pytree
@@ -262,13 +315,21 @@ class Extraction:
     """
 
     lines: Lines
+    """Line segments in the world, with the error of the pose in their covariances."""
     circles: Circles
-    jac_line_pose: Float[Array, "K 2 3"]  # d(offset, angle) / d(x, y, theta)
-    cov_measurement: Float[Array, "K 2 2"]  # of (offset, angle), from the sensor's noise alone
-    line_of_beam: Int[Array, " N"]  # slot in `lines`, -1 for none
-    circle_of_beam: Int[Array, " N"]  # slot in `circles`, -1 for none
+    """Circles in the world, likewise."""
+    jac_line_pose: Float[Array, "K 2 3"]
+    """P, d(offset, angle) / d(x, y, theta) of the pose."""
+    cov_measurement: Float[Array, "K 2 2"]
+    """M, covariance of (offset, angle) from the sensor's noise alone: m^2, m rad, rad^2."""
+    line_of_beam: Int[Array, " N"]
+    """For each beam the slot of its line in `lines`, -1 for none."""
+    circle_of_beam: Int[Array, " N"]
+    """For each beam the slot of its circle in `circles`, -1 for none."""
     rejected: Rejected
+    """How many points were turned away, by criterion."""
     status: Int[Array, ""]
+    """Bits of `Status`."""
 
 
 @pytree
@@ -281,25 +342,38 @@ class Report:
     """
 
     line_slot: Int[Array, " L"]
+    """Slot in the map of each line of the scan, or `NEW`, or `LEFT_OUT`."""
     line_nis: Float[Array, " L"]
+    """Normalised innovation squared of its best geometric match."""
     line_dof: Int[Array, " L"]
+    """Degrees of freedom of that: 2, or 0 where nothing was compared."""
     circle_slot: Int[Array, " C"]
+    """Slot in the map of each circle of the scan, or `NEW`, or `LEFT_OUT`."""
     circle_nis: Float[Array, " C"]
+    """Normalised innovation squared of the nearest circle."""
     circle_dof: Int[Array, " C"]
-    added: Int[Array, ""]  # lines and circles new in the map
-    fused: Int[Array, ""]  # lines and circles of the map improved by this scan
-    merged: Int[Array, ""]  # lines of the map joined with another one
-    trimmed: Int[Array, ""]  # lines shortened by wiping
-    split: Int[Array, ""]  # lines cut into several by wiping
-    deleted: Int[Array, ""]  # lines and circles gone
+    """Degrees of freedom of that: 3, or 0 where nothing was compared."""
+    added: Int[Array, ""]
+    """Lines and circles new in the map."""
+    fused: Int[Array, ""]
+    """Lines and circles of the map improved by this scan."""
+    merged: Int[Array, ""]
+    """Lines of the map joined with another one."""
+    trimmed: Int[Array, ""]
+    """Lines shortened by wiping."""
+    split: Int[Array, ""]
+    """Lines cut into several by wiping."""
+    deleted: Int[Array, ""]
+    """Lines and circles gone."""
     status: Int[Array, ""]
+    """Bits of `Status`."""
 
 
 SlotsT = TypeVar("SlotsT", Lines, Circles)
 
 
 def squared(root: Float[Array, "*s n m"]) -> Float[Array, "*s n n"]:
-    """A A^T, the matrix of which A is a square root."""
+    """A A^T, the matrix of which A = `root` is a square root."""
     return jnp.sum(root[..., :, None, :] * root[..., None, :, :], -1)
 
 
@@ -310,7 +384,7 @@ LEFT_OUT = -2
 
 
 def empty_lines(capacity: int, dtype: Any = None) -> Lines:
-    """`capacity` free slots for lines. The dtype is jax's default unless given."""
+    """`capacity` free slots for lines. The `dtype` is jax's default unless given."""
     dtype = jnp.asarray(0.0).dtype if dtype is None else jax.dtypes.canonicalize_dtype(dtype)
     return Lines(
         anchor=_filled((capacity, 2), 0, dtype),
@@ -327,7 +401,7 @@ def empty_lines(capacity: int, dtype: Any = None) -> Lines:
 
 
 def empty_circles(capacity: int, dtype: Any = None) -> Circles:
-    """`capacity` free slots for circles. The dtype is jax's default unless given."""
+    """`capacity` free slots for circles. The `dtype` is jax's default unless given."""
     dtype = jnp.asarray(0.0).dtype if dtype is None else jax.dtypes.canonicalize_dtype(dtype)
     return Circles(
         center=_filled((capacity, 2), 0, dtype),
@@ -346,9 +420,9 @@ def _filled(shape: tuple[int, ...], value: float, dtype: Any) -> Array:
 
 
 def pad_stack(stacked: Any, size: int) -> Any:
-    """Stacked items filled up to `size` by repeating the last one; whoever uses them knows how many count.
+    """The items of the pytree `stacked`, filled up to `size` by repeating the last one.
 
-    On the host, where nothing has to be compiled.
+    Whoever uses them knows how many count. On the host, where nothing has to be compiled.
     """
 
     def fill(x: Array) -> Array:

@@ -34,11 +34,17 @@ class Swath:
     """What the returns of a scan prove to be free."""
 
     points: Points
-    reach: Float[Array, " N"]  # m, with the extension behind the line that the beam met; 0 if it met none
-    own: Int[Array, " N"]  # slot of the map's line that the beam measures, -1 for none
-    times: Int[Array, " N"]  # how often that line was detected, 0 for none
-    joined: Bool[Array, " N"]  # neighbour of the next one
-    robot: Float[Array, "2"]  # m, in the world
+    """Points of the scan."""
+    reach: Float[Array, " N"]
+    """Range up to which the beam wipes, with the extension behind the line that it met; 0 if it met none. m."""
+    own: Int[Array, " N"]
+    """Slot of the map's line that the beam measures, -1 for none."""
+    times: Int[Array, " N"]
+    """How often that line was detected, 0 for none."""
+    joined: Bool[Array, " N"]
+    """Whether the beam is a neighbour of the next one."""
+    robot: Float[Array, "2"]
+    """Position of the robot in the world, m."""
 
 
 @pytree
@@ -46,11 +52,17 @@ class Triangles:
     """Wipe-triangles, section 6.2: the scanner and the pushed-back ends of a line, from the scanner."""
 
     first: Float[Array, "L 2"]
+    """Corner behind the begin of the line that the scan saw, from the laser, m."""
     second: Float[Array, "L 2"]
-    own: Int[Array, " L"]  # slot of the line that spans it
+    """Corner behind its end, from the laser, m."""
+    own: Int[Array, " L"]
+    """Slot of the line that spans it."""
     valid: Bool[Array, " L"]
-    apex: Float[Array, "2"]  # m, the laser from the robot
-    robot: Float[Array, "2"]  # m, in the world
+    """Which slots are in use."""
+    apex: Float[Array, "2"]
+    """The laser, from the robot, m."""
+    robot: Float[Array, "2"]
+    """Position of the robot in the world, m."""
 
 
 @pytree
@@ -58,9 +70,13 @@ class Wiped:
     """Counts of what wiping did to lines."""
 
     trimmed: Int[Array, ""]
+    """Lines shortened."""
     split: Int[Array, ""]
+    """Lines cut into several."""
     deleted: Int[Array, ""]
-    overflow: Bool[Array, ""]  # a fragment found no free slot
+    """Lines gone."""
+    overflow: Bool[Array, ""]
+    """Whether a fragment found no free slot."""
 
 
 Stretches = tuple[Float[Array, " M"], Float[Array, " M"], Bool[Array, " M"]]
@@ -86,6 +102,9 @@ def swath_of_scan(
       own: for each new line the line of the map that it is, or may be; -1 for none.
       times: how often that line was detected; 0 if the new line is no part of it.
       thresholds: `wipe_extension`, `gap_beams`.
+
+    Returns:
+      What `passed_through` needs, of `N` beams.
     """
     to_line = found.anchor - (pose.mean[:2] + points.laser)[None]
     across = jnp.abs(found.offset + dot(found.normal, to_line))  # the scanner from each line
@@ -124,6 +143,9 @@ def passed_through(
       cov_pose: covariance of the pose.
       thresholds: `wipe_...`, `match_distance`.
       noise: of the sensor.
+
+    Returns:
+      Begin and end of each stretch, m from the anchor, and whether it is gone. Shapes `[N - 1]`.
     """
     points = swath.points
     normal, tangent = line.normal, line.tangent
@@ -156,6 +178,15 @@ def may_have_passed(line: Lines, slot: Int[Array, ""], swath: Swath, thresholds:
     """Whether `passed_through` can find anything: false for nearly all lines of a map, and cheap to tell.
 
     Two beams must pass a line by `match_distance`, or reach behind it; no spread is computed, and nothing divided.
+
+    Args:
+      line: one line, no batch axis, directed.
+      slot: where it stands in the map.
+      swath: the beams.
+      thresholds: `match_distance`.
+
+    Returns:
+      Whether it is worth while to look.
     """
     points = swath.points
     normal, tangent = line.normal, line.tangent
@@ -183,6 +214,9 @@ def triangles_of_scan(
       model: the lines of the map.
       targets: the slots of those lines, -1 for none.
       thresholds: `wipe_extension`.
+
+    Returns:
+      `L` triangles; not valid for slots of -1, and where the laser lies on the line.
     """
     base = take(model, targets)
     apex = (pose.mean[:2] + points.laser)[None]
@@ -209,6 +243,9 @@ def inside_triangles(line: Lines, slot: Int[Array, ""], triangles: Triangles) ->
       line: one line, no batch axis.
       slot: where it stands in the map.
       triangles: of this scan.
+
+    Returns:
+      Begin and end of each stretch, m from the anchor, and whether there is one. Shapes `[L]`.
     """
     start = line.anchor - triangles.robot - triangles.apex + line.offset * line.normal
     tangent = line.tangent
@@ -241,6 +278,9 @@ def var_of_cut(
       points: of the scan.
       pose: of the robot.
       noise: of the sensor.
+
+    Returns:
+      The variance, m^2.
     """
     from_robot = line.anchor - pose.mean[:2] + line.offset * line.normal + along * line.tangent
     from_laser = from_robot - points.laser
@@ -277,6 +317,9 @@ def wipe_lines(
       var_cut: variance of an end that was cut, m^2, given the line and where the end is, m from the anchor.
       thresholds: `min_length`.
       share_information: whether the fragments of a line do.
+
+    Returns:
+      The lines of the map, with fragments in free slots; and how many were trimmed, split and deleted.
     """
     k = model.valid.shape[0]
 
@@ -356,6 +399,16 @@ def passed_circles(
 
     A circle is gone if every beam through the window in which it may stand, at least two of them, ends beyond it; and
     if it is wide enough for no two beams to pass it by on either side.
+
+    Args:
+      circles: the `C` circles of the map.
+      swath: the beams.
+      cov_pose: covariance of the pose: m^2, m rad, rad^2. Shape `[3, 3]`.
+      thresholds: `wipe_sigmas`.
+      noise: of the sensor.
+
+    Returns:
+      Which of them are gone. Shape `[C]`.
     """
 
     def gone(center: Array, radius: Array) -> Array:
@@ -381,7 +434,15 @@ def passed_circles(
 
 
 def circles_inside_triangles(circles: Circles, triangles: Triangles) -> Bool[Array, " C"]:
-    """Section 6.3: circles are deleted if they lie inside a wipe-triangle. Taken by their centres."""
+    """Section 6.3: circles are deleted if they lie inside a wipe-triangle. Taken by their centres.
+
+    Args:
+      circles: the `C` circles of the map.
+      triangles: of this scan.
+
+    Returns:
+      Which of them are gone. Shape `[C]`.
+    """
 
     def inside(center: Array, first: Array, second: Array) -> Array:
         start = center - triangles.robot - triangles.apex

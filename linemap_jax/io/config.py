@@ -1,9 +1,7 @@
 """Settings from a TOML file, and into one."""
 
-import ast
 import dataclasses
 import difflib
-import inspect
 import os
 import textwrap
 import tomllib
@@ -11,6 +9,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from linemap_jax.core.fields import meanings_of
 from linemap_jax.core.settings import Persistence, Rules, SensorNoise, Thresholds
 
 SECTIONS: dict[str, type] = {"thresholds": Thresholds, "noise": SensorNoise, "rules": Rules, "persistence": Persistence}
@@ -73,25 +72,12 @@ def config_text(settings: Mapping[str, Any]) -> str:
     blocks = []
     for section, instance in settings.items():
         lines = [f"[{section}]"]
-        for name, meaning in _meanings(SECTIONS[section]).items():
+        for name, (_, meaning) in meanings_of(SECTIONS[section]).items():
             value = getattr(instance, name)
             told = str(value).lower() if isinstance(value, bool) else repr(value)
             lines += [*textwrap.wrap(meaning, 96, initial_indent="# ", subsequent_indent="# "), f"{name} = {told}"]
         blocks.append("\n".join(lines))
     return "\n\n".join(blocks) + "\n"
-
-
-def _meanings(cls: type) -> dict[str, str]:
-    """The fields of a class and the strings below them, which Python itself does not keep."""
-    (definition,) = ast.parse(textwrap.dedent(inspect.getsource(cls))).body
-    assert isinstance(definition, ast.ClassDef)
-    body = definition.body
-    return {
-        field.target.id: " ".join(text.value.value.split())
-        for field, text in zip(body, body[1:], strict=False)
-        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)
-        if isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant) and isinstance(text.value.value, str)
-    }
 
 
 def _nearest(name: str, known: Iterable[str]) -> str:

@@ -68,7 +68,11 @@ def plot_map(
 
 
 def draw_map(line_map: LineMap, trajectory: ArrayLike | None = None, *, title: str, level: float = 0.95) -> Figure:
-    """The picture of `plot_map` as a figure, to show or to save otherwise; pyplot does not know of it."""
+    """The picture of `plot_map` as a figure, to show or to save otherwise; pyplot does not know of it.
+
+    Raises:
+      ValueError: if `level` does not lie between 0 and 1.
+    """
     if not 0 < level < 1:
         raise ValueError(f"level must be between 0 and 1, not {level}")
     path = finite_path(trajectory)

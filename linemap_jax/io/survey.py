@@ -25,6 +25,9 @@ def describe(log: Log) -> dict[str, Any]:
       `rate_hz`, `beams`, `bearings_rad` (first, step, last), `range_min_m`, `range_max_m`, the shares of what beams
       brought back, and the share of scans with a pose; `warnings`. If no scan can be read, `refused` says why, and what
       is told of scans is missing.
+
+    Raises:
+      LogError: if the log cannot be read, and holds no message that tells anything.
     """
     seen = _Seen()
     refused = None

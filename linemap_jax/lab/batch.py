@@ -40,6 +40,9 @@ def mesh_of_devices(count: int | None = None) -> Mesh:
     Args:
       count: how many of them; all, of all hosts, unless given.
 
+    Returns:
+      A mesh of one axis.
+
     Raises:
       ValueError: if there are not so many.
     """
@@ -101,7 +104,7 @@ def run_chunks(
 
 
 def told_by_the_first(number: int) -> int:
-    """A number as the first process has it, in all processes."""
+    """`number` as the first process has it, in all processes."""
     return int(multihost_utils.broadcast_one_to_all(np.int32(number)))
 
 
@@ -127,6 +130,9 @@ def run_batch(experiment: Experiment, runs: Any, *common: Any, **options: Any) -
       runs: what the runs differ by; stacked `[R]`.
       *common: what they have in common.
       **options: of `run_chunks`.
+
+    Returns:
+      The results, as NumPy arrays.
     """
     chunks = [chunk for _, chunk in run_chunks(experiment, runs, *common, **options)]
     return jax.tree.map(lambda *x: np.concatenate(x), *chunks)

@@ -25,6 +25,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int
 
 from linemap_jax.core.extract import extract
+from linemap_jax.core.fields import documented
 from linemap_jax.core.frames import dot, perp, reanchor, unit, wrap_angle
 from linemap_jax.core.propagation import square_root
 from linemap_jax.core.settings import SCAN_CAPACITY, Capacity, Mount, SensorNoise
@@ -57,22 +58,30 @@ SMALLEST = 1e-6
 """No sigma is less, m or rad."""
 
 
+@documented
 class Estimate(NamedTuple):
     """Maximum-likelihood estimates of standard deviations."""
 
-    sigma: np.ndarray  # [n]
-    interval: np.ndarray  # [n, 2] of 95 %, from the curvature of the log-likelihood in log(sigma)
-    used: int  # residuals or innovations
+    sigma: np.ndarray
+    """Standard deviations."""
+    interval: np.ndarray
+    """Their intervals of 95 %, from the curvature of the log-likelihood in log(sigma)."""
+    used: int
+    """Number of residuals or innovations that were used."""
 
 
 @pytree
 class Residuals:
     """Beams about the lines that they lie on; `K` lines of `N` beams, of which each has some."""
 
-    along: Float[Array, "*t N"]  # m, range less the range at which the beam meets the line
-    by_line: Float[Array, "*t N 2"]  # derivative of the latter by offset (per unit) and angle (m)
-    sway: Float[Array, "*t N"]  # m / rad, by the bearing
-    line: Int[Array, "*t N"]  # slot of its line, -1 for beams that are not used
+    along: Float[Array, "*t N"]
+    """Range less the range at which the beam meets the line, m."""
+    by_line: Float[Array, "*t N 2"]
+    """Derivative of the latter by offset (per unit) and angle (m)."""
+    sway: Float[Array, "*t N"]
+    """Derivative by the bearing, m / rad."""
+    line: Int[Array, "*t N"]
+    """Slot of its line, -1 for beams that are not used."""
 
 
 @partial(jax.jit, static_argnames="capacity")
@@ -83,6 +92,9 @@ def residuals_of(scan: Scan, noise: SensorNoise, *, capacity: Capacity = SCAN_CA
       scan: `N` beams.
       noise: what is believed until now; decides with the thresholds what is a line.
       capacity: slots for lines.
+
+    Returns:
+      The residuals of the beams that lie on a line; zeros for the others.
     """
     here = Pose(mean=jnp.zeros(3, scan.ranges.dtype), cov=jnp.zeros((3, 3), scan.ranges.dtype))
     found = extract(scan, here, noise=noise, capacity=capacity, jacobians="analytic")
@@ -165,13 +177,25 @@ def restricted_likelihood(log_sigma: Float[Array, "2"], residuals: Residuals, ca
       log_sigma: logarithms of the sigmas of a range (m) and of a bearing (rad).
       residuals: of `N` beams.
       capacity: slots of the lines.
+
+    Returns:
+      The logarithm.
     """
     fits = _fit(log_sigma, residuals, capacity)
     return -jnp.sum(jnp.where(fits.points > 0, fits.log_det + fits.misfit, 0)) / 2
 
 
 def single_surfaces(log_sigma: Float[Array, "2"], residuals: Residuals, capacity: int) -> Residuals:
-    """The residuals without those of lines that fit too badly to be one surface, by `MISFIT`."""
+    """The residuals without those of lines that fit too badly to be one surface, by `MISFIT`.
+
+    Args:
+      log_sigma: logarithms of the sigmas of a range (m) and of a bearing (rad).
+      residuals: of `N` beams.
+      capacity: slots of the lines.
+
+    Returns:
+      The residuals, with fewer lines.
+    """
     fits = _fit(log_sigma, residuals, capacity)
     dof = jnp.maximum(fits.points - 2, 1)
     bad = fits.misfit > dof + MISFIT * jnp.sqrt(2 * dof)
@@ -196,6 +220,9 @@ def sensor_noise(
       start: what is believed at first.
       capacity: slots for the lines of a scan.
       rounds: how often is estimated.
+
+    Returns:
+      Two sigmas, m and rad, and their 95 % intervals.
 
     Raises:
       ValueError: if hardly a line was found.
@@ -226,18 +253,34 @@ def sensor_noise(
 class Innovations:
     """Lines of one scan against those of another, `L` pairs; free slots are zero, with a variance of one."""
 
-    change: Float[Array, "*t L 2"]  # m, rad: the second less the first, at the anchor of the first
-    cov: Float[Array, "*t L 2 2"]  # of that from the sensor's noise
-    by_first: Float[Array, "*t L 2 3"]  # by the pose of the first scan
+    change: Float[Array, "*t L 2"]
+    """Offset and angle, the second less the first, at the anchor of the first. m, rad."""
+    cov: Float[Array, "*t L 2 2"]
+    """Covariance of that from the sensor's noise."""
+    by_first: Float[Array, "*t L 2 3"]
+    """Derivative by the pose of the first scan."""
     by_second: Float[Array, "*t L 2 3"]
+    """Derivative by the pose of the second scan."""
     valid: Bool[Array, "*t L"]
+    """Which slots are in use."""
 
 
 @partial(jax.jit, static_argnames="capacity")
 def innovations_of(
     scans: Scan, poses: Float[Array, "2 3"], noise: SensorNoise, mount: Mount, *, capacity: Capacity = SCAN_CAPACITY
 ) -> Innovations:
-    """The innovation of two scans, `[2, N]`, at the poses that are believed."""
+    """The innovation of two scans, `[2, N]`, at the poses that are believed.
+
+    Args:
+      scans: two, stacked.
+      poses: of the robot at both, as believed. m, m, rad. Shape `[2, 3]`.
+      noise: of the sensor.
+      mount: of the scanner on the robot.
+      capacity: slots for the lines of a scan.
+
+    Returns:
+      For each line of the first scan by how much its view in the second differs; not valid where it has none.
+    """
     nothing = jnp.zeros((3, 3), poses.dtype)
 
     def found_at(t: int) -> Extraction:
@@ -312,6 +355,9 @@ def innovation_likelihood(log_sigma: Float[Array, "5"], innovations: Innovations
     Args:
       log_sigma: logarithms of the sigmas of x, y (m) and theta (rad), and of W: offset (m) and angle (rad).
       innovations: `L` pairs of lines.
+
+    Returns:
+      The logarithm.
     """
     scale, walls = jnp.exp(log_sigma[:3]), jnp.exp(2 * log_sigma[3:])
     count = innovations.valid.shape[0]
@@ -355,6 +401,9 @@ def pose_noise(
       lag: from one scan of a pair to the other; errors that last longer are not seen.
       capacity: slots for the lines of a scan.
 
+    Returns:
+      Five sigmas: m, m, rad; m, rad; and their 95 % intervals.
+
     Raises:
       ValueError: if there is no pair, or hardly any line is seen by both scans of a pair.
     """
@@ -384,6 +433,9 @@ def maximise(negative: Callable[[Array, Any], Array], start: Float[Array, " n"],
       start: log(sigma) at first.
       data: a pytree of arrays.
       used: how many numbers the data holds, for the record.
+
+    Returns:
+      The sigmas, with intervals from the curvature at the maximum.
     """
     optimiser = optax.lbfgs()
 

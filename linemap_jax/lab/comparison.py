@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from linemap_jax.core.fields import documented
 from linemap_jax.core.frames import dot, unit
 from linemap_jax.core.matching import LineComparison, compare_lines, normal_variance
 from linemap_jax.core.settings import Mount, Thresholds
@@ -40,33 +41,53 @@ END_SLACK = 0.1
 What = Literal["moved", "vanished", "appeared"]
 
 
+@documented
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Change:
     """One line or circle, or a piece of a line, that is not in both maps at the same place."""
 
     what: What
+    """What has happened to it."""
     kind: Literal["line", "circle"]
-    slot_a: int | None  # in the first map; None for what has appeared
-    slot_b: int | None  # in the second map; None for what has vanished
-    begin: tuple[float, float]  # m; of what has moved, where it was; of a circle, its centre
-    end: tuple[float, float]  # m; of a circle, its centre
-    radius: float | None  # m, of a circle
-    times_detected: int  # in the map that holds it; of what has moved, in the one that has seen it less
-    shift: tuple[float, float] | None = None  # m, of what has moved
-    sigma: float | None = None  # m, of the length of the shift
-    turn: float | None = None  # rad, of a line that has moved
-    p: float | None = None  # of what has moved: the p-value of Holm
-    passed: int | None = None  # beams of the other map's log that went through where it was or is; None without a log
-    met: int | None = None  # beams of the other map's log that ended there
+    """What it is."""
+    slot_a: int | None
+    """Slot in the first map; None for what has appeared."""
+    slot_b: int | None
+    """Slot in the second map; None for what has vanished."""
+    begin: tuple[float, float]
+    """Begin of a line, centre of a circle; of what has moved, where it was. m."""
+    end: tuple[float, float]
+    """End of a line, centre of a circle, m."""
+    radius: float | None
+    """Radius of a circle, m."""
+    times_detected: int
+    """How many scans have seen it, in the map that holds it; of what has moved, in the one that has seen it less."""
+    shift: tuple[float, float] | None = None
+    """How far and where to it has moved, m."""
+    sigma: float | None = None
+    """Standard deviation of the length of the shift, m."""
+    turn: float | None = None
+    """By how much a line has turned, rad."""
+    p: float | None = None
+    """The p-value of Holm, of what has moved."""
+    passed: int | None = None
+    """Beams of the other map's log that went through where it was or is; None without a log."""
+    met: int | None = None
+    """Beams of the other map's log that ended there."""
 
 
+@documented
 class Comparison(NamedTuple):
     """What `compare_maps` has found."""
 
     changes: list[Change]
-    same_lines: int  # lines of the first map that the second one holds too
+    """What has changed."""
+    same_lines: int
+    """Lines of the first map that the second one holds too."""
     same_circles: int
-    pairs: int  # that were held against each other
+    """Circles of the first map that the second one holds too."""
+    pairs: int
+    """Pairs that were held against each other."""
 
 
 def compare_maps(
@@ -126,7 +147,10 @@ def compare_maps(
 
 
 def holm(p: Float[np.ndarray, " M"]) -> Float[np.ndarray, " M"]:
-    """The p-values of Holm's step-down procedure: to reject those below alpha errs at all with probability alpha."""
+    """The p-values of Holm's step-down procedure, from `p`, those of the single tests.
+
+    To reject those below alpha errs at all with probability alpha.
+    """
     order = np.argsort(p)
     scaled = np.maximum.accumulate((p.size - np.arange(p.size)) * p[order])
     adjusted = np.empty_like(p)
@@ -155,6 +179,9 @@ def looked_through(
       mount: of the scanner on the robot.
       chunk: size to which pieces are filled up.
       slack: m.
+
+    Returns:
+      The same changes, those in question with `passed` and `met`.
     """
     meant = [i for i, change in enumerate(changes) if change.what == what]
     lines = [i for i in meant if changes[i].kind == "line"]

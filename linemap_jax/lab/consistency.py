@@ -26,6 +26,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from linemap_jax.core.extract import extract
+from linemap_jax.core.fields import documented
 from linemap_jax.core.frames import dot, unit, wrap_angle
 from linemap_jax.core.fusion import at_first_angle, forget, fuse_lines
 from linemap_jax.core.lines import MIN_POINTS, measure_lines
@@ -62,18 +63,23 @@ SEEN_BEAMS = 10
 class Walls:
     """Straight walls, the truth that lines are held against."""
 
-    point: Float[Array, "W 2"]  # m, on the wall
-    angle: Float[Array, " W"]  # rad, of the normal
+    point: Float[Array, "W 2"]
+    """A point on each wall, m."""
+    angle: Float[Array, " W"]
+    """Direction of its normal, rad."""
 
 
 def walls_of(world: World) -> Walls:
-    """The segments of a world as boundless lines."""
+    """The segments of a `world` as boundless lines."""
     step = world.segments.ends[:, 1] - world.segments.ends[:, 0]
     return Walls(point=world.segments.ends.mean(1), angle=jnp.arctan2(step[:, 1], step[:, 0]) - jnp.pi / 2)
 
 
 def line_error(lines: Lines, wall: Walls) -> Float[Array, "*s 2"]:
-    """The error of (offset, angle), at the anchor of the line. A line may lie either way round."""
+    """The error of (offset, angle) of `lines` that are a `wall`, at their anchors. m, rad.
+
+    A line may lie either way round.
+    """
     turn = wrap_angle(lines.angle - wall.angle)
     reverse = jnp.abs(turn) > jnp.pi / 2
     turn = jnp.where(reverse, turn - jnp.sign(turn) * jnp.pi, turn)
@@ -83,16 +89,20 @@ def line_error(lines: Lines, wall: Walls) -> Float[Array, "*s 2"]:
 
 
 def nees(error: Float[Array, "*s n"], cov: Float[Array, "*s n n"]) -> Float[Array, "*s"]:
-    """Normalised estimation error squared, e^T C^-1 e, for n of 2 or 3."""
+    """Normalised estimation error squared, e^T C^-1 e, of e = `error` and C = `cov`, for n of 2 or 3."""
     return quadratic(error, inverse(cov))
 
 
+@documented
 class Sample(NamedTuple):
     """What one run has to say."""
 
     nees: Any
-    error: Any  # [n] the estimate less the truth, in axes of the experiment
-    counts: Any  # false where nothing was found
+    """Squared error of the estimate in units of its covariance."""
+    error: Any
+    """The estimate less the truth, in axes of the experiment, shape `[n]`."""
+    counts: Any
+    """False where nothing was found."""
 
 
 class Fit(enum.Enum):
@@ -120,6 +130,9 @@ def known_points(
       pose: the true one.
       scanner: its noise is what the fit believes.
       cov_pose: of the pose's error.
+
+    Returns:
+      One sample for each kind of fit.
     """
     of_wall, of_scan, of_pose = jax.random.split(key, 3)
     which, _ = _visible_wall(of_wall, world, pose, scanner)
@@ -150,6 +163,9 @@ def pipeline(
       scanner: its noise is what the extraction believes.
       cov_pose: of the pose's error.
       **options: of `extract`.
+
+    Returns:
+      The sample of the longest line, and those of all lines, `[K]`.
     """
     of_wall, of_scan, of_pose = jax.random.split(key, 3)
     which, seen = _visible_wall(of_wall, world, pose, scanner)
@@ -218,11 +234,14 @@ def rho_errors(
     return errors, on_wall[line] >= MIN_POINTS
 
 
+@documented
 class Model(NamedTuple):
     """What a map believes of the pose's error."""
 
     pose_error: PoseError
+    """How the errors of the poses hang together."""
     persistence: Persistence | None = None
+    """How they go on, where `pose_error` is "persistent"."""
 
 
 def fused(
@@ -361,9 +380,13 @@ class Cell:
     """One configuration of a table."""
 
     world: World
-    path: Float[Array, "T 3"]  # true poses; the first one is where single scans are taken
+    """What the scanner is in."""
+    path: Float[Array, "T 3"]
+    """True poses; the first one is where single scans are taken."""
     scanner: Scanner
+    """The instrument."""
     cov_pose: Float[Array, "3 3"]
+    """Covariance of the poses' errors: m^2, m rad, rad^2."""
 
 
 def cells() -> dict[str, Cell]:
@@ -406,15 +429,22 @@ def cells() -> dict[str, Cell]:
     }
 
 
+@documented
 class Verdict(NamedTuple):
     """What many runs say of one configuration."""
 
     runs: int
-    found: float  # share of runs in which there was something to judge
+    """Number of runs."""
+    found: float
+    """Share of runs in which there was something to judge."""
     mean: float
+    """Mean of the NEES."""
     median: float
-    inside: float  # share inside the 95 % ellipse
-    bias: tuple[float, ...]  # mean of each number's error over its spread
+    """Median of the NEES."""
+    inside: float
+    """Share inside the 95 % ellipse."""
+    bias: tuple[float, ...]
+    """Mean of each number's error over its spread."""
 
 
 def judge(sample: Sample) -> Verdict:
@@ -422,6 +452,9 @@ def judge(sample: Sample) -> Verdict:
 
     Args:
       sample: stacked, of two numbers (lines) or three (circles).
+
+    Returns:
+      What the runs say together.
 
     Raises:
       ValueError: if there are fewer than two runs that count.
@@ -441,11 +474,14 @@ def judge(sample: Sample) -> Verdict:
     )
 
 
+@documented
 class Bands(NamedTuple):
     """Where mean and coverage lie, with a given probability for all cells of a table together."""
 
     mean: tuple[float, float]
+    """Least and largest mean of the NEES."""
     inside: tuple[float, float]
+    """Least and largest share inside the 95 % ellipse."""
 
 
 def bands(runs: int, cells: int = 1, *, error: float = 0.001, dof: int = 2) -> Bands:
@@ -468,6 +504,6 @@ def bands(runs: int, cells: int = 1, *, error: float = 0.001, dof: int = 2) -> B
 
 
 def holds(verdict: Verdict, band: Bands) -> bool:
-    """Whether mean and coverage lie in their bands."""
+    """Whether mean and coverage of a `verdict` lie in their `band`."""
     in_mean = band.mean[0] <= verdict.mean <= band.mean[1]
     return in_mean and band.inside[0] <= verdict.inside <= band.inside[1]

@@ -58,6 +58,9 @@ def known_points(
       pose: the true one.
       scanner: its noise is what the fit believes.
       cov_pose: of the pose's error.
+
+    Returns:
+      The two samples by their names.
     """
     scan, truth, pose, estimate = _look(key, center, radius, pose, scanner, cov_pose)
     fit, arc = (_measure(scan, estimate, scanner, fit=which) for which in (True, False))
@@ -89,6 +92,9 @@ def pipeline(
       scanner: as above.
       cov_pose: as above.
       **options: of `extract`.
+
+    Returns:
+      The sample; it does not count where there is no fitted circle.
     """
     scan, _, pose, estimate = _look(key, center, radius, pose, scanner, cov_pose)
     circles = extract(scan, estimate, noise=noise_of(scanner), **options).circles

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from linemap_jax.core.fields import documented
 from linemap_jax.core.frames import dot
 from linemap_jax.core.sensor import points_from_scan
 from linemap_jax.core.settings import Mount, Number
@@ -172,14 +173,20 @@ def beam_residuals(
     return jax.lax.map(one, (scans, poses))
 
 
+@documented
 class LogScore(NamedTuple):
     """A map against a log, without a truth; NaN where there is nothing to tell of."""
 
-    returns: int  # nearer than 20 m
-    explained: float  # share of them that lie within 10 cm of a line or of the rim of a circle
-    met: float  # share of them whose beam meets the map
-    residual_median: float  # m, of the absolute residuals along those beams
-    residual_90: float  # m, 90 % of them are less
+    returns: int
+    """Returns nearer than 20 m."""
+    explained: float
+    """Share of them that lie within 10 cm of a line or of the rim of a circle."""
+    met: float
+    """Share of them whose beam meets the map."""
+    residual_median: float
+    """Median of the absolute residuals along those beams, m."""
+    residual_90: float
+    """What 90 % of them are less than, m."""
 
 
 def evaluate_log(
@@ -192,6 +199,9 @@ def evaluate_log(
       chunks: stacked scans and poses, at most `chunk` of them each time.
       mount: of the scanner on the robot.
       chunk: size to which pieces are filled up.
+
+    Returns:
+      Shares and residuals; NaN where there is nothing to judge by.
     """
     line_map = _without_free_slots(line_map)
     hits = total = 0
@@ -230,7 +240,7 @@ def seen_in_log(
 
 
 def world_of_map(line_map: LineMap) -> World:
-    """The world that a map describes: each line a wall, each circle a pole."""
+    """The world that `line_map` describes: each line a wall, each circle a pole."""
     lines, circles = line_map.lines, line_map.circles
     index = jnp.arange(lines.valid.shape[0], dtype=jnp.int32)
 

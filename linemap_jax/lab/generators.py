@@ -27,6 +27,9 @@ def room(width: Number, depth: Number, angle: Number = 0.0) -> World:
       width: along its own x axis, m.
       depth: along its own y axis, m.
       angle: of that x axis, rad.
+
+    Returns:
+      A world of four segments.
     """
     dtype = jnp.result_type(float, *(x for x in (width, depth, angle) if not isinstance(x, float | int)))
     center = jnp.zeros(2, dtype)
@@ -44,6 +47,12 @@ def free_room(key: Array, *, vertices: int, size: Number = 5.0, dtype: Any = Non
       vertices: number of corners and of walls, 3 or more. Few give corners of all kinds, many a wavy wall.
       size: typical distance of the walls from the origin, m.
       dtype: of the world; jax's default unless given.
+
+    Returns:
+      A world of as many segments.
+
+    Raises:
+      ValueError: if `vertices` is less than 3.
     """
     if vertices < 3:
         raise ValueError(f"a room has three corners at least, not {vertices}")
@@ -73,6 +82,12 @@ def rectilinear_room(
       column: typical length of a wall along the axis, m.
       angle: of the axis, rad; any one unless given.
       dtype: of the world; jax's default unless given.
+
+    Returns:
+      A world of as many segments.
+
+    Raises:
+      ValueError: if `vertices` is odd or less than 4.
     """
     if vertices < 4 or vertices % 2:
         raise ValueError(f"a room of right angles has an even number of corners from 4 on, not {vertices}")
@@ -110,6 +125,9 @@ def corridor(key: Array, *, rooms: int = 3, dtype: Any = None) -> World:
       key: decides the width of the corridor, and size, door and place of each room.
       rooms: on each side.
       dtype: of the world; jax's default unless given.
+
+    Returns:
+      The world.
     """
     dtype = _float(dtype)
     length = 4.5 * rooms
@@ -155,6 +173,9 @@ def ring(key: Array, *, boxes: int = 14, dtype: Any = None) -> World:
       key: decides the places, sizes and directions of the boxes.
       boxes: how many.
       dtype: of the world; jax's default unless given.
+
+    Returns:
+      The world.
     """
     dtype = _float(dtype)
     outer, inner = jnp.asarray([24.0, 14.0], dtype), jnp.asarray([16.0, 6.0], dtype)
@@ -186,6 +207,9 @@ def changing_room(key: Array, *, scans: int, dtype: Any = None) -> World:
       key: decides places, sizes and times.
       scans: of the drive.
       dtype: of the world; jax's default unless given.
+
+    Returns:
+      The world.
     """
     dtype = _float(dtype)
     of_order, of_rest = jax.random.split(key)
@@ -222,6 +246,9 @@ def laboratory(key: Array, *, jitter: Number = 0.1, change: Time = NEVER, dtype:
         stays free. 0: all of it stands where it is drawn below.
       change: scan index at which box and door have changed.
       dtype: of the world; jax's default unless given.
+
+    Returns:
+      The world.
     """
     dtype = _float(dtype)
     furniture = len(_BOXES) + len(_DESKS) + len(_TABLES) + len(_COLUMNS) + 1

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int8, Shaped
 
+from linemap_jax.core.fields import documented
 from linemap_jax.core.settings import Mount
 from linemap_jax.core.state import Pose, Scan
 
@@ -29,12 +30,16 @@ _HALF = 1 << (_FRACTION - 1)
 Chunks = Iterable[tuple[Scan, Pose]]
 
 
+@documented
 class Grid(NamedTuple):
     """An occupancy grid."""
 
-    cells: Int8[np.ndarray, "H W"]  # row 0 is the lowest y, column 0 the lowest x
-    origin: Float[np.ndarray, "2"]  # m, the lower left corner of cell (0, 0)
-    resolution: float  # m, the side of a cell
+    cells: Int8[np.ndarray, "H W"]
+    """Row 0 is the lowest y, column 0 the lowest x."""
+    origin: Float[np.ndarray, "2"]
+    """The lower left corner of cell (0, 0), m."""
+    resolution: float
+    """The side of a cell, m."""
 
 
 def returns_in_world(

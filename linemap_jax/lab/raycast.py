@@ -20,8 +20,10 @@ NOTHING = -1
 class Hits:
     """What beams meet."""
 
-    ranges: Float[Array, " N"]  # m, infinity where a beam meets nothing
-    thing: Int[Array, " N"]  # segment `i` is `i`, pole `j` is `S + j`, nothing is `NOTHING`
+    ranges: Float[Array, " N"]
+    """Ranges; infinity where a beam meets nothing. m."""
+    thing: Int[Array, " N"]
+    """Segment `i` is `i`, pole `j` is `S + j`, nothing is `NOTHING`."""
 
 
 def cast(world: World, origin: Float[Array, "2"], directions: Float[Array, "N 2"], *, scan_index: Time = 0) -> Hits:
@@ -35,6 +37,9 @@ def cast(world: World, origin: Float[Array, "2"], directions: Float[Array, "N 2"
       origin: where the beams start, m.
       directions: unit vectors; their dtype is that of the ranges. Shape `[N, 2]`.
       scan_index: when.
+
+    Returns:
+      Ranges in metres, and which thing each beam meets.
     """
     # Differences first: far from the origin of the world, a lower precision would lose them.
     dtype = directions.dtype

@@ -127,7 +127,7 @@ class Odometry:
 
 
 def increments(poses: Float[Array, "T 3"]) -> Float[Array, "T-1 3"]:
-    """Each pose but the first, seen from the one before it: x ahead, y to the left, turn. m, m, rad."""
+    """Each of the `poses` but the first, seen from the one before it: x ahead, y to the left, turn. m, m, rad."""
     return jax.vmap(between)(poses[:-1], poses[1:])
 
 
@@ -168,6 +168,9 @@ def dead_reckoning(start: Float[Array, "3"], steps: Float[Array, "S 3"]) -> Floa
     Args:
       start: x, y, theta. m, m, rad.
       steps: increments, each in the frame of the pose before it. Shape `[S, 3]`.
+
+    Returns:
+      x, y, theta in (-pi, pi]. m, m, rad.
     """
     theta = start[2] + jnp.concatenate([jnp.zeros(1, start.dtype), jnp.cumsum(steps[:, 2])])
     c, s = jnp.cos(theta[:-1]), jnp.sin(theta[:-1])
@@ -204,7 +207,16 @@ def pose_errors(key: Array, cov: Float[Array, "3 3"], *, count: int, correlation
 
 
 def estimate_pose(key: Array, pose: Float[Array, "3"], cov: Float[Array, "3 3"]) -> Pose:
-    """What the robot believes of one pose; as `estimate_poses`."""
+    """What the robot believes of one pose; as `estimate_poses`.
+
+    Args:
+      key: of the error.
+      pose: the true one. m, m, rad. Shape `[3]`.
+      cov: of the error, in the axes of the world: m^2, m rad, rad^2. Shape `[3, 3]`.
+
+    Returns:
+      The pose with its error, and its covariance.
+    """
     return jax.tree.map(lambda x: x[0], estimate_poses(key, pose[None], cov))
 
 

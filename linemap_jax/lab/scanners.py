@@ -45,10 +45,14 @@ class Scanner:
 class Truth:
     """What the beams of a scan really did."""
 
-    bearings: Float[Array, " N"]  # rad, the true direction of each beam, in the frame of the scanner
-    ranges: Float[Array, " N"]  # m, without noise; infinity where the beam meets nothing
-    thing: Int[Array, " N"]  # what it meets, as in `Hits`; `NOTHING` for a mixed reading
-    mixed: Bool[Array, " N"]  # whether the reading lies between two things
+    bearings: Float[Array, " N"]
+    """The true direction of each beam, in the frame of the scanner, rad."""
+    ranges: Float[Array, " N"]
+    """Ranges without noise; infinity where the beam meets nothing. m."""
+    thing: Int[Array, " N"]
+    """What it meets, as in `Hits`; `NOTHING` for a mixed reading."""
+    mixed: Bool[Array, " N"]
+    """Whether the reading lies between two things."""
 
 
 def sweep(first: float, last: float, count: int) -> Float[Array, " N"]:
@@ -58,6 +62,9 @@ def sweep(first: float, last: float, count: int) -> Float[Array, " N"]:
       first: rad.
       last: rad; larger than `first` for a sweep to the left.
       count: of the beams.
+
+    Returns:
+      rad. Shape `[N]`.
     """
     return jnp.linspace(first, last, count)
 
@@ -126,7 +133,18 @@ def simulate_scan(
 def simulate_scans(
     key: Array, world: World, poses: Float[Array, "T 3"], scanner: Scanner, mount: Mount | None = None
 ) -> tuple[Scan, Truth]:
-    """A scan at each pose, the first one at scan index 0; as `simulate_scan`, stacked."""
+    """A scan at each pose, the first one at scan index 0; as `simulate_scan`, stacked.
+
+    Args:
+      key: of all noise.
+      world: what is around.
+      poses: of the robot, the true ones. m, m, rad. Shape `[T, 3]`.
+      scanner: the instrument.
+      mount: of the scanner on the robot.
+
+    Returns:
+      The scans and what their beams met, `T` of them stacked.
+    """
     count = poses.shape[0]
 
     def one(key: Array, pose: Float[Array, "3"], index: Int[Array, ""]) -> tuple[Scan, Truth]:
@@ -141,6 +159,9 @@ def noise_of(scanner: Scanner, *, at: Number = 5.0) -> SensorNoise:
     Args:
       scanner: the instrument.
       at: the range at which noise that grows with the range is taken, m.
+
+    Returns:
+      Standard deviations of a range, m, and of a bearing, rad.
     """
     variance = jnp.square(scanner.range_sigma) + jnp.square(scanner.relative_sigma * at) + jnp.square(scanner.step) / 12
     return SensorNoise(range_sigma=jnp.sqrt(variance), bearing_sigma=jnp.asarray(scanner.bearing_sigma))

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from linemap_jax.core.fields import documented
 from linemap_jax.core.frames import dot, perp, rotate, unit
 from linemap_jax.core.settings import Mount, Number
 from linemap_jax.core.state import Circles, Extraction, LineMap, Lines, Scan, pytree
@@ -50,18 +51,36 @@ class Gates:
 class Seen:
     """In how many scans beams came back from the things of a world."""
 
-    cells: Int[Array, "S P"]  # from each cell of each segment, as `Gates.cell` and `P` divide it
-    poles: Int[Array, " C"]  # from each pole, `MIN_RETURNS` or more
+    cells: Int[Array, "S P"]
+    """Returns from each cell of each segment, as `Gates.cell` and `P` divide it."""
+    poles: Int[Array, " C"]
+    """Returns from each pole, `MIN_RETURNS` or more."""
 
 
 def seen_nothing(world: World, *, cells: int = CELLS) -> Seen:
-    """Before the first scan. More cells than are needed cost time only."""
+    """Before the first scan. More cells than are needed cost time only.
+
+    Args:
+      world: of `S` segments and `C` poles.
+      cells: into how many cells a segment is divided at most; more than are needed cost time only.
+
+    Returns:
+      Zeros.
+    """
     segments, poles = world.segments.valid.shape[0], world.poles.valid.shape[0]
     return Seen(cells=jnp.zeros((segments, cells), jnp.int32), poles=jnp.zeros(poles, jnp.int32))
 
 
 def seen_everything(world: World, *, cells: int = CELLS) -> Seen:
-    """As if each cell and pole had been seen in more scans than anyone asks for."""
+    """As if each cell and pole had been seen in more scans than anyone asks for.
+
+    Args:
+      world: of `S` segments and `C` poles.
+      cells: as of `seen_nothing`.
+
+    Returns:
+      Large numbers.
+    """
     return jax.tree.map(lambda x: jnp.full_like(x, NEVER), seen_nothing(world, cells=cells))
 
 
@@ -85,6 +104,9 @@ def look(
       pose: the true one, of the robot.
       mount: of the scanner on the robot.
       gates: `cell`; the same for all scans.
+
+    Returns:
+      The numbers of scans, with this one.
     """
     gates = gates or Gates()
     segments, poles = world.segments.valid.shape[0], world.poles.valid.shape[0]
@@ -116,6 +138,9 @@ def expected(
       pose: of the robot.
       mount: of the scanner on the robot.
       scan_index: when.
+
+    Returns:
+      What each beam meets, and how far away.
     """
     origin, heading = _placed(pose, mount)
     hits = cast(world, origin, unit(heading + scan.bearings), scan_index=scan_index)
@@ -145,6 +170,9 @@ def survey(
       mount: of the scanner on the robot.
       first: scan index of the first one.
       gates: `cell`.
+
+    Returns:
+      The numbers of scans, with these.
     """
 
     def step(seen: Seen, x: tuple[Scan, Array, Array]) -> tuple[Seen, None]:
@@ -208,28 +236,47 @@ class Score:
     A circle is on a pole if its centre lies inside the pole or within that distance of it.
     """
 
-    line_length: Float[Array, ""]  # m, of all lines
-    line_length_on_walls: Float[Array, ""]  # m
-    wall_seen: Float[Array, " S"]  # m of each wall that have been seen
-    wall_held: Float[Array, " S"]  # m of that on which a line is
-    wall_twice: Float[Array, " S"]  # m of each wall beside which lie two lines or more
-    wall_pieces: Int[Array, " S"]  # pieces in which it is held: one more for each gap that was seen right across
-    held_twice: Bool[Array, " S"]  # `wall_twice` is at least `Gates.overlap`, or half of the wall
+    line_length: Float[Array, ""]
+    """Length of all lines, m."""
+    line_length_on_walls: Float[Array, ""]
+    """Length of theirs that is on walls, m."""
+    wall_seen: Float[Array, " S"]
+    """How much of each wall has been seen, m."""
+    wall_held: Float[Array, " S"]
+    """How much of that has a line on it, m."""
+    wall_twice: Float[Array, " S"]
+    """How much of each wall has two lines or more beside it, m."""
+    wall_pieces: Int[Array, " S"]
+    """Pieces in which it is held: one more for each gap that was seen right across."""
+    held_twice: Bool[Array, " S"]
+    """`wall_twice` is at least `Gates.overlap`, or half of the wall."""
 
-    line_share: Float[Array, " K"]  # of its length that is on walls
-    wall_of_line: Int[Array, " K"]  # the wall that it runs along for longest, the nearest of equal ones; -1 for none
-    line_error: Float[Array, "K 2"]  # m, rad: offset and angle at the anchor, from that wall; 0 for none
-    line_nees: Float[Array, " K"]  # of that error; 0 for none
-    phantom_line: Bool[Array, " K"]  # less than half of it is on walls
+    line_share: Float[Array, " K"]
+    """Share of its length that is on walls."""
+    wall_of_line: Int[Array, " K"]
+    """The wall that it runs along for longest, the nearest of equal ones; -1 for none."""
+    line_error: Float[Array, "K 2"]
+    """Offset and angle at the anchor, from that wall; 0 for none. m, rad."""
+    line_nees: Float[Array, " K"]
+    """NEES of that error; 0 for none."""
+    phantom_line: Bool[Array, " K"]
+    """Whether less than half of it is on walls."""
 
-    circles_of_pole: Int[Array, " C"]  # circles on each pole that is there
-    missed_pole: Bool[Array, " C"]  # it is there and has been seen, and no circle is on it
-    pole_of_circle: Int[Array, " M"]  # the nearest that it is on, -1 for none
-    circle_error: Float[Array, "M 3"]  # m, of x, y, radius; 0 for none
-    circle_nees: Float[Array, " M"]  # of that error, of fitted circles; 0 for others
-    phantom_circle: Bool[Array, " M"]  # it is on no pole, and no wall is within `Gates.distance` of its disc
+    circles_of_pole: Int[Array, " C"]
+    """Circles on each pole that is there."""
+    missed_pole: Bool[Array, " C"]
+    """Whether it is there and has been seen, and no circle is on it."""
+    pole_of_circle: Int[Array, " M"]
+    """The nearest pole that it is on, -1 for none."""
+    circle_error: Float[Array, "M 3"]
+    """Errors of x, y, radius; 0 for none. m."""
+    circle_nees: Float[Array, " M"]
+    """NEES of that error, of fitted circles; 0 for others."""
+    phantom_circle: Bool[Array, " M"]
+    """Whether it is on no pole, and no wall is within `Gates.distance` of its disc."""
 
-    object_held: Float[Array, " O"]  # as of `held`
+    object_held: Float[Array, " O"]
+    """How much of each object is held, as `held` counts."""
 
     @property
     def precision(self) -> Float[Array, "*b"]:
@@ -275,6 +322,9 @@ def evaluate(
       seen: of that world; only what has been seen can be missed. All of it unless given.
       scan_index: what is there at this scan is the truth.
       gates: what counts as the same.
+
+    Returns:
+      Lengths, counts and errors, of each line, circle, wall and pole.
     """
     gates = gates or Gates()
     seen = seen_everything(world) if seen is None else seen
@@ -355,12 +405,16 @@ def held(line_map: LineMap, world: World, seen: Seen, *, scan_index: Time = 0, g
     return _held(by_lines, near, world, seen, scan_index, gates)
 
 
+@documented
 class Matches(NamedTuple):
     """What became of the lines of one scan that walls have given."""
 
-    true: Int[Array, ""]  # matched with a line of the map that runs along the same wall
-    false: Int[Array, ""]  # matched with one that does not
-    missed: Int[Array, ""]  # not matched, although the map holds their stretch of the wall
+    true: Int[Array, ""]
+    """Lines matched with a line of the map that runs along the same wall."""
+    false: Int[Array, ""]
+    """Lines matched with one that does not."""
+    missed: Int[Array, ""]
+    """Lines not matched, although the map holds their stretch of the wall."""
 
 
 @jax.jit
@@ -386,6 +440,9 @@ def judge_matches(
       truth: what the beams met.
       scan_index: of the scan.
       gates: what counts as the same.
+
+    Returns:
+      How many lines of the scan were matched rightly, wrongly, or not though they should have been.
     """
     gates = gates or Gates()
     walls = _walls(world)
@@ -436,7 +493,14 @@ def scans_until(
 
 
 def times_of_objects(world: World) -> tuple[Int[Array, " O"], Int[Array, " O"], Bool[Array, " O"]]:
-    """When each object appears and vanishes, and which of them there are. Bodies by their number, then poles."""
+    """When each object appears and vanishes, and which of them there are. Bodies by their number, then poles.
+
+    Args:
+      world: of `S` segments and `C` poles; `O = S + C`.
+
+    Returns:
+      First scan with it, first scan without it, and whether there is such an object. Shapes `[O]`.
+    """
     segments, poles = world.segments, world.poles
     count = segments.valid.shape[0]
     into = jnp.where(segments.valid, segments.body, count)

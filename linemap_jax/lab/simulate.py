@@ -17,10 +17,15 @@ class Simulation:
     """A simulated log, with the truth beside it. Arrays are stacked over the `T` scans."""
 
     scans: Scan
-    poses: Pose  # as the robot believes them
-    odometry: Float[Array, "S 3"]  # S = T - 1 increments as counted: x ahead, y to the left, turn. m, m, rad
-    true_poses: Float[Array, "T 3"]  # x, y, theta. m, m, rad
-    truth: Truth  # what the beams really did
+    """What the scanner tells, `T` scans stacked."""
+    poses: Pose
+    """Poses as the robot believes them."""
+    odometry: Float[Array, "S 3"]
+    """`S = T - 1` increments as counted: x ahead, y to the left, turn. m, m, rad."""
+    true_poses: Float[Array, "T 3"]
+    """x, y, theta of the robot in truth. m, m, rad."""
+    truth: Truth
+    """What the beams really did."""
 
 
 def simulate(
@@ -47,6 +52,9 @@ def simulate(
       odometry: how well the wheels count.
       mount: of the scanner on the robot.
       turns: how the robot drives; see `robot.drive`.
+
+    Returns:
+      What a log would hold, and the truth.
     """
     of_scans, of_poses, of_odometry = jax.random.split(key, 3)
     true_poses = drive(world.path, count=count, turns=turns)

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from linemap_jax.core.extract import as_dtype, observe, with_defaults
+from linemap_jax.core.fields import documented
 from linemap_jax.core.mapping import empty_map, integrate
 from linemap_jax.core.settings import (
     Capacity,
@@ -44,10 +45,14 @@ SCANS_TO_NOTICE = 3
 class Trial:
     """What one trial may differ by from another."""
 
-    key: Any  # of all noise
-    world: World  # with a path of one way point at least
+    key: Any
+    """PRNG key of all noise."""
+    world: World
+    """With a path of one way point at least."""
     thresholds: Thresholds = Thresholds()
-    noise: SensorNoise | None = None  # what the map builder believes; that of the scanner unless given
+    """Of the map builder."""
+    noise: SensorNoise | None = None
+    """What the map builder believes; that of the scanner unless given."""
 
 
 @pytree
@@ -55,39 +60,67 @@ class Conditions:
     """What the trials have in common."""
 
     scanner: Scanner
-    cov_pose: Float[Array, "3 3"]  # of each believed pose, in the axes of the world. m^2, m rad, rad^2
-    correlation: Number = 0.0  # of the pose error, from one scan to the next; see `robot.pose_errors`
+    """The instrument."""
+    cov_pose: Float[Array, "3 3"]
+    """Covariance of each believed pose, in the axes of the world: m^2, m rad, rad^2."""
+    correlation: Number = 0.0
+    """Of the pose error, from one scan to the next; see `robot.pose_errors`."""
 
 
 @pytree
 class Outcome:
     """What a trial comes to. Lengths and errors are those of `scoring.evaluate` after the last scan."""
 
-    line_length: Float[Array, ""]  # m, of all lines
-    line_length_on_walls: Float[Array, ""]  # m
-    wall_seen: Float[Array, ""]  # m of wall that have been seen
-    wall_held: Float[Array, ""]  # m of that on which a line is
+    line_length: Float[Array, ""]
+    """Length of all lines, m."""
+    line_length_on_walls: Float[Array, ""]
+    """Length of theirs that is on walls, m."""
+    wall_seen: Float[Array, ""]
+    """How much wall has been seen, m."""
+    wall_held: Float[Array, ""]
+    """How much of that has a line on it, m."""
     lines: Int[Array, ""]
+    """Lines of the map."""
     phantom_lines: Int[Array, ""]
-    walls: Int[Array, ""]  # that have been seen
-    duplicates: Int[Array, ""]  # walls that are held twice
-    fragments: Int[Array, ""]  # pieces too many
+    """Lines of which less than half is on walls."""
+    walls: Int[Array, ""]
+    """Walls that have been seen."""
+    duplicates: Int[Array, ""]
+    """Walls that are held twice."""
+    fragments: Int[Array, ""]
+    """Pieces in which walls are held, beyond one each."""
     lines_on_walls: Int[Array, ""]
-    square_error: Float[Array, "2"]  # m^2, rad^2: sums over the lines on walls
-    nees: Float[Array, ""]  # sum over them
-    covered: Int[Array, ""]  # of them inside the 95 % ellipse
-    poles: Int[Array, ""]  # that are there and have been seen
+    """Lines that run along a wall."""
+    square_error: Float[Array, "2"]
+    """Sums of the squared errors of offset and angle over the lines on walls. m^2, rad^2."""
+    nees: Float[Array, ""]
+    """Sum of their NEES."""
+    covered: Int[Array, ""]
+    """How many of them have the truth inside their 95 % ellipse."""
+    poles: Int[Array, ""]
+    """Poles that are there and have been seen."""
     missed_poles: Int[Array, ""]
+    """Poles on which there is no circle, of these."""
     circles: Int[Array, ""]
+    """Circles of the map."""
     phantom_circles: Int[Array, ""]
-    true_matches: Int[Array, ""]  # of lines, over all scans; see `scoring.Matches`
+    """Circles on no pole and near no wall."""
+    true_matches: Int[Array, ""]
+    """True matches of lines, over all scans; see `scoring.Matches`."""
     false_matches: Int[Array, ""]
+    """False ones."""
     missed_matches: Int[Array, ""]
-    vanished: Int[Array, ""]  # objects that the map held, and that beams then passed through in `SCANS_TO_NOTICE` scans
-    gone: Int[Array, ""]  # of these, gone from the map after so many
-    appeared: Int[Array, ""]  # objects that came, and of which `SCANS_TO_NOTICE` scans had returns
-    noticed: Int[Array, ""]  # of these, in the map after so many
-    full: Bool[Array, ""]  # the map or a scan had no slot left
+    """Missed ones."""
+    vanished: Int[Array, ""]
+    """Objects that the map held, and that beams then passed through in `SCANS_TO_NOTICE` scans."""
+    gone: Int[Array, ""]
+    """Of these, gone from the map after so many."""
+    appeared: Int[Array, ""]
+    """Objects that came, and of which `SCANS_TO_NOTICE` scans had returns."""
+    noticed: Int[Array, ""]
+    """Of these, in the map after so many."""
+    full: Bool[Array, ""]
+    """Whether the map or a scan had no slot left."""
 
 
 def trial(
@@ -118,6 +151,9 @@ def trial(
       segmentation: how points are divided into lines.
       covariance: "exact" or "printed".
       jacobians: "autodiff" or "analytic".
+
+    Returns:
+      Counts and sums, from which `summary` makes shares.
     """
     world, scanner = run.world, conditions.scanner
     dtype = world.dtype
@@ -240,7 +276,7 @@ def sweep(thresholds: Thresholds, names: Sequence[str]) -> tuple[list[tuple[str,
 
 
 def columns_of(outcomes: Outcome) -> dict[str, np.ndarray]:
-    """Stacked outcomes as the columns of a table, by the names of the fields."""
+    """Stacked `outcomes` as the columns of a table, by the names of the fields."""
     return {field.name: np.asarray(getattr(outcomes, field.name)) for field in dataclasses.fields(Outcome)}
 
 
@@ -249,6 +285,9 @@ def summary(columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
 
     Args:
       columns: as of `columns_of`, `[R]` rows each.
+
+    Returns:
+      Numbers by their names, for JSON.
     """
     total = {field.name: np.sum(columns[field.name], 0) for field in dataclasses.fields(Outcome)}
 
@@ -296,6 +335,12 @@ def mistakes(columns: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]
     The kinds are line on no wall, wall without a line, wall that is held twice, match that is false, match that was
     missed, object that has vanished and is still in the map after `SCANS_TO_NOTICE` scans, and one that has come and is
     not. Both shapes `[R, 7]`.
+
+    Args:
+      columns: as of `columns_of`, `[R]` rows each.
+
+    Returns:
+      How much went wrong, and out of how much. Shapes `[R, 7]`.
     """
     c = {field.name: np.asarray(columns[field.name], float) for field in dataclasses.fields(Outcome)}
     matches = c["true_matches"] + c["false_matches"] + c["missed_matches"]
@@ -312,15 +357,22 @@ def mistakes(columns: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]
     return wrong, whole
 
 
+@documented
 class Recommendation(NamedTuple):
     """What a sweep says of one threshold."""
 
     threshold: str
-    values: np.ndarray  # [F], the present one times `FACTORS`
-    costs: np.ndarray  # [F], sum of the shares of all kinds of mistakes; from 0 to 7
-    differences: np.ndarray  # [F], of the cost from that of the present value
-    errors: np.ndarray  # [F], standard errors of these
-    value: float  # that is recommended
+    """Name of the threshold."""
+    values: np.ndarray
+    """The present one times `FACTORS`, shape `[F]`."""
+    costs: np.ndarray
+    """Sum of the shares of all kinds of mistakes; from 0 to 7, shape `[F]`."""
+    differences: np.ndarray
+    """Difference of the cost from that of the present value, shape `[F]`."""
+    errors: np.ndarray
+    """Standard errors of these, shape `[F]`."""
+    value: float
+    """The value that is recommended."""
 
 
 def recommend(

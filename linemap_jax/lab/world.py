@@ -41,23 +41,34 @@ class Kind(enum.IntEnum):
 class Segments:
     """Straight pieces of surface. Those of one body stand one behind the other and form a chain."""
 
-    ends: Float[Array, "S 2 2"]  # m, begin and end
-    body: Int[Array, " S"]  # which thing they belong to, from 0 on
-    kind: Int[Array, " S"]  # what that thing is, a `Kind`
-    appears: Int[Array, " S"]  # first scan in which it is there
-    vanishes: Int[Array, " S"]  # first scan in which it is gone
+    ends: Float[Array, "S 2 2"]
+    """Begin and end of each, m."""
+    body: Int[Array, " S"]
+    """Which thing they belong to, from 0 on."""
+    kind: Int[Array, " S"]
+    """What that thing is, a `Kind`."""
+    appears: Int[Array, " S"]
+    """First scan in which it is there."""
+    vanishes: Int[Array, " S"]
+    """First scan in which it is gone."""
     valid: Bool[Array, " S"]
+    """Which slots are in use."""
 
 
 @pytree
 class Poles:
     """Round things, solid."""
 
-    center: Float[Array, "C 2"]  # m
-    radius: Float[Array, " C"]  # m
-    appears: Int[Array, " C"]  # first scan in which it is there
-    vanishes: Int[Array, " C"]  # first scan in which it is gone
+    center: Float[Array, "C 2"]
+    """Centres, m."""
+    radius: Float[Array, " C"]
+    """Radii, m."""
+    appears: Int[Array, " C"]
+    """First scan in which it is there."""
+    vanishes: Int[Array, " C"]
+    """First scan in which it is gone."""
     valid: Bool[Array, " C"]
+    """Which slots are in use."""
 
 
 @pytree
@@ -68,8 +79,11 @@ class World:
     """
 
     segments: Segments
+    """Straight pieces of surface."""
     poles: Poles
-    path: Float[Array, "W 2"]  # m
+    """Round things."""
+    path: Float[Array, "W 2"]
+    """Way points, m."""
 
     @property
     def dtype(self) -> Any:
@@ -78,7 +92,7 @@ class World:
 
 
 def there(things: Segments | Poles, scan_index: Time) -> Bool[Array, " K"]:
-    """Which segments or poles are there at a scan. Shape `[K]`."""
+    """Which of the `things`, segments or poles, are there at the scan `scan_index`. Shape `[K]`."""
     return things.valid & (things.appears <= scan_index) & (scan_index < things.vanishes)
 
 
@@ -92,6 +106,9 @@ def polygon(
       kind: what it encloses. A wall has `K - 1` segments, the others `K`.
       appears: first scan in which it is there.
       vanishes: first scan in which it is gone.
+
+    Returns:
+      A world of one body, without a path.
     """
     ends = jnp.stack([corners, jnp.roll(corners, -1, 0)], 1)
     ends = ends[:-1] if kind == Kind.WALL else ends
@@ -130,12 +147,25 @@ def box(
       kind: what it encloses.
       appears: first scan in which it is there.
       vanishes: first scan in which it is gone.
+
+    Returns:
+      A world of one body, without a path.
     """
     return polygon(rectangle(center, width, depth, angle), kind, appears=appears, vanishes=vanishes)
 
 
 def rectangle(center: Float[Array, "2"], width: Number, depth: Number, angle: Number = 0.0) -> Float[Array, "4 2"]:
-    """The corners of a turned rectangle, counter-clockwise; arguments as of `box`."""
+    """The corners of a turned rectangle, counter-clockwise.
+
+    Args:
+      center: in metres.
+      width: along its own x axis, m.
+      depth: along its own y axis, m.
+      angle: of that x axis, rad.
+
+    Returns:
+      In metres. Shape `[4, 2]`.
+    """
     x = unit(jnp.asarray(angle, center.dtype))
     across, along = (jnp.asarray(size, center.dtype) / 2 for size in (width, depth))
     return jnp.stack([center + i * across * x + j * along * perp(x) for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
@@ -151,6 +181,9 @@ def poles(
       radius: of all, or of each, m.
       appears: first scan in which they are there.
       vanishes: first scan in which they are gone.
+
+    Returns:
+      A world without segments and path.
     """
     count, dtype = center.shape[0], center.dtype
     return World(
@@ -174,7 +207,14 @@ def poles(
 
 
 def join(*parts: World) -> World:
-    """One world of all the parts, in their order; bodies are numbered through, paths follow one another."""
+    """One world of all the parts, in their order; bodies are numbered through, paths follow one another.
+
+    Args:
+      *parts: worlds.
+
+    Returns:
+      The world.
+    """
     first_body = 0
     numbered = []
     for part in parts:
@@ -193,6 +233,9 @@ def moved(world: World, pose: Float[Array, "3"]) -> World:
     Args:
       world: what was the world becomes a frame, whose pose is given.
       pose: x, y, theta. m, m, rad.
+
+    Returns:
+      The world in the frame in which the pose is given.
     """
 
     def move(points: Float[Array, "*s 2"]) -> Float[Array, "*s 2"]:
@@ -216,6 +259,9 @@ def pad(world: World, *, segments: int, poles: int, path: int) -> World:
       poles: slots for poles.
       path: number of way points; the last one is repeated.
 
+    Returns:
+      The world; the slots that were added are free.
+
     Raises:
       ValueError: if the world does not fit.
     """
@@ -235,11 +281,11 @@ def pad(world: World, *, segments: int, poles: int, path: int) -> World:
 
 
 def world_from_arrays(arrays: Mapping[str, Any]) -> World:
-    """A world from the arrays of its fields, such as `linemap_jax.io.worlds.read_world` gives them."""
+    """A world from the `arrays` of its fields, such as `linemap_jax.io.worlds.read_world` gives them."""
     fields = jax.tree.map(jnp.asarray, dict(arrays))
     return World(segments=Segments(**fields["segments"]), poles=Poles(**fields["poles"]), path=fields["path"])
 
 
 def arrays_from_world(world: World) -> dict[str, Any]:
-    """The arrays of a world, by field: the inverse of `world_from_arrays`, on the host."""
+    """The arrays of a `world`, by field: the inverse of `world_from_arrays`, on the host."""
     return jax.tree.map(np.asarray, dataclasses.asdict(world))

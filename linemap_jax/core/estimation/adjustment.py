@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from linemap_jax.core.estimation.pose_graph import PoseGraph
 from linemap_jax.core.extract import extract
+from linemap_jax.core.fields import documented
 from linemap_jax.core.frames import between, dot, perp, rotate, unit, wrap_angle
 from linemap_jax.core.matching import best_line, with_sign
 from linemap_jax.core.propagation import apply, inverse, propagate, square_root, symmetric
@@ -36,21 +37,33 @@ class LineSightings:
     """Lines of the map, each as a keyframe has seen it, in the frame of the scanner."""
 
     keyframe: Int[Array, " O"]
-    line: Int[Array, " O"]  # slot in the map
-    anchor: Float[Array, "O 2"]  # m; a point of the line as it was seen
-    angle: Float[Array, " O"]  # rad, of the normal, which points as that of the line in the map
-    cov: Float[Array, "O 2 2"]  # of (offset, angle) at the anchor, by the scanner's noise alone
+    """Number of the keyframe from which the line was seen."""
+    line: Int[Array, " O"]
+    """Slot of the line in the map."""
+    anchor: Float[Array, "O 2"]
+    """A point of the line as it was seen, in the frame of the scanner, m."""
+    angle: Float[Array, " O"]
+    """Direction of the normal, which points as that of the line in the map, rad."""
+    cov: Float[Array, "O 2 2"]
+    """Covariance of (offset, angle) at the anchor, by the scanner's noise alone: m^2, m rad, rad^2."""
     valid: Bool[Array, " O"]
+    """Which slots are in use."""
 
 
+@documented
 class Adjusted(NamedTuple):
     """Poses and lines that fit best."""
 
-    poses: Float[Array, "N 3"]  # of the scanner at the keyframes. m, m, rad
+    poses: Float[Array, "N 3"]
+    """Poses of the scanner at the keyframes. m, m, rad."""
     cov_poses: Float[Array, "N 3 3"]
-    lines: Lines  # offset, angle and covariance are those of the adjustment where `seen`
-    seen: Bool[Array, " K"]  # lines of which there is a sighting that fits
-    unit_variance: Float[Array, ""]  # of the sightings' residuals: 1 where they err as they say
+    """Covariances of these: m^2, m rad, rad^2."""
+    lines: Lines
+    """Lines of the map; offset, angle and covariance are those of the adjustment where `seen`."""
+    seen: Bool[Array, " K"]
+    """Which lines have a sighting that fits."""
+    unit_variance: Float[Array, ""]
+    """Variance of the sightings' residuals: 1 where they err as they say."""
 
 
 def sightings_of_scan(
@@ -73,6 +86,9 @@ def sightings_of_scan(
       thresholds: of extraction and matching.
       noise: of the scanner.
       **options: the remaining ones of `extract`.
+
+    Returns:
+      The sightings; those of lines that match no line of the map are not valid.
     """
     found = extract(scan, pose, thresholds=thresholds, noise=noise, **options)
     slot, nis = best_line(found.lines, lines, thresholds, "independent")
@@ -101,6 +117,9 @@ def residual_of_sighting(
       at: anchor of the line in the map.
       anchor: of the sighting, in the frame of the scanner.
       angle: of the sighting's normal, likewise.
+
+    Returns:
+      Offset in metres and angle in radians; zeros for a line seen where it is. Shape `[2]`.
     """
     seen = pose[:2] + rotate(pose[2], anchor)
     offset = line[0] + dot(unit(line[1]), at - seen)
@@ -120,6 +139,9 @@ def adjust(graph: PoseGraph, lines: Lines, sightings: LineSightings) -> Adjusted
       graph: keyframes, optimised. The first one is held.
       lines: of the map, near where the graph has them.
       sightings: of these lines from these keyframes.
+
+    Returns:
+      Poses, lines, and the covariances of both.
     """
     n, k = graph.poses.shape[0], lines.offset.shape[0]
     root = jnp.swapaxes(square_root(inverse(sightings.cov)), -1, -2)
@@ -219,6 +241,9 @@ def with_error_of_poses(
       seen: lines of which the covariance holds the poses' errors already.
       poses: of the keyframes. m, m, rad.
       cov_poses: of these.
+
+    Returns:
+      The map with larger covariances; its estimates do not change.
     """
 
     def nearest_pose(place: Float[Array, "2"]) -> tuple[Array, Array]:

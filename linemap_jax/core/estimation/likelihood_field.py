@@ -39,15 +39,24 @@ Counts = tuple[tuple[int, int], ...]
 class LikelihoodField:
     """Distances to the nearest primitive of a map, at the centres of square cells."""
 
-    distance: Float[Array, "G G"]  # m, at most `FARTHEST`; by column (x) and row (y)
-    origin: Float[Array, "2"]  # m, lower left corner
-    cell: Float[Array, ""]  # m, side of a cell
+    distance: Float[Array, "G G"]
+    """Distance to the nearest surface of the map, at most `FARTHEST`, m; by column (x) and row (y)."""
+    origin: Float[Array, "2"]
+    """Lower left corner, m."""
+    cell: Float[Array, ""]
+    """Side of a cell, m."""
 
 
 def field_size(line_map: LineMap) -> int:
     """How many cells a side of the field of a map should have: a power of two, so that few programs are compiled.
 
     On the host.
+
+    Args:
+      line_map: the map, on the host.
+
+    Returns:
+      Cells of a side.
     """
     low, high = (np.asarray(x) for x in _bounds(line_map))
     wanted = float(np.max(high - low)) / CELL
@@ -60,6 +69,9 @@ def field_of_map(line_map: LineMap, size: int) -> LikelihoodField:
     Args:
       line_map: the map; an empty one gives a field in which everything is far from anything.
       size: G, cells of a side.
+
+    Returns:
+      Distances to the map at the middles of `G` by `G` cells.
     """
     lines, circles = directed(line_map.lines), line_map.circles
     low, high = _bounds(line_map)
@@ -94,7 +106,7 @@ def _bounds(line_map: LineMap) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
 
 
 def distances(field: LikelihoodField, points: Float[Array, "N 2"]) -> Float[Array, " N"]:
-    """Distances to the nearest primitive, m; `FARTHEST` outside of the field."""
+    """Distances of `points` (world, m) to the nearest primitive of the map of a `field`, m; `FARTHEST` outside."""
     index = jnp.floor((points - field.origin[None]) / field.cell).astype(jnp.int32)
     size = field.distance.shape[0]
     inside = jnp.all((index >= 0) & (index < size), -1)
@@ -117,6 +129,9 @@ def log_likelihood(
       valid: those that count. Shape `[N]`.
       pose: of the robot.
       sigma: of the distances, m: of the size of the steps of the search.
+
+    Returns:
+      The logarithm of a likelihood, but for a constant; never positive.
     """
     turned = jax.vmap(lambda p: rotate(pose[2], p))(points)
     squares = (distances(field, turned + pose[None, :2]) / sigma) ** 2
@@ -124,7 +139,7 @@ def log_likelihood(
 
 
 def thinned(points: Float[Array, "N d"], valid: Bool[Array, " N"]) -> tuple[Float[Array, "B d"], Bool[Array, " B"]]:
-    """Some of the beams, evenly spread."""
+    """At most `BEAMS` of the `points` and of what is `valid` of them, evenly spread."""
     n = points.shape[0]
     index = np.linspace(0, n - 1, min(BEAMS, n)).round().astype(int)
     return points[index], valid[index]
@@ -151,6 +166,9 @@ def search(
       mean: of the prior.
       root: a square root of the prior's covariance.
       counts: nodes of the grids.
+
+    Returns:
+      The pose of the best node of the finest grid. m, m, rad. Shape `[3]`.
     """
     at = jnp.zeros(3, mean.dtype)  # in sigmas
     span = jnp.full(3, REACH, mean.dtype)

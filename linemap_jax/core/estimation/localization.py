@@ -130,11 +130,16 @@ class LocalizationSettings:
 class Belief:
     """What the filter knows of the pose. Primitives of the map are counted lines first, then circles."""
 
-    mean: Float[Array, "3"]  # x, y, theta; m, m, rad
-    cov_own: Float[Array, "3 3"]  # of the part that is independent of the map's errors
-    by_map: Float[Array, "3 M 2"]  # how the map's errors have moved the pose, each in units of its sigma
-    fit: Float[Array, ""]  # average over the latest scans, see `LocalizationSettings.least_fit`
+    mean: Float[Array, "3"]
+    """x, y, theta. m, m, rad."""
+    cov_own: Float[Array, "3 3"]
+    """Covariance of the part that is independent of the map's errors: m^2, m rad, rad^2."""
+    by_map: Float[Array, "3 M 2"]
+    """How the map's errors have moved the pose, each in units of its sigma."""
+    fit: Float[Array, ""]
+    """Average of the fit over the latest scans, see `LocalizationSettings.least_fit`."""
     lost: Bool[Array, ""]
+    """Whether the latest scans did not fit the map."""
 
     @property
     def cov(self) -> Float[Array, "3 3"]:
@@ -151,44 +156,74 @@ class Belief:
 class Located:
     """What the filter says after one scan."""
 
-    pose: Pose  # of the robot
-    nis: Float[Array, ""]  # of all sightings together
-    dof: Int[Array, ""]  # its degrees of freedom; 0 where nothing was used
-    lines: Int[Array, ""]  # how many lines, or groups of points, were used
-    circles: Int[Array, ""]  # how many circles
-    fit: Float[Array, ""]  # share of the returns explained, less share that contradict the map
+    pose: Pose
+    """Pose of the robot in the map."""
+    nis: Float[Array, ""]
+    """Normalised innovation squared of all sightings together."""
+    dof: Int[Array, ""]
+    """Its degrees of freedom; 0 where nothing was used."""
+    lines: Int[Array, ""]
+    """How many lines, or groups of points, were used."""
+    circles: Int[Array, ""]
+    """How many circles were used."""
+    fit: Float[Array, ""]
+    """Share of the returns explained, less share that contradict the map."""
     status: Int[Array, ""]
+    """Bits of `Status`."""
 
 
 @pytree
 class Seen:
     """What a scan holds, in the frame of the robot."""
 
-    lines: Lines  # with covariances of the measurement alone
-    circles: Circles  # likewise
-    collinear: Bool[Array, "L L"]  # which lines may be pieces of one
-    points: Float[Array, "N 2"]  # m
-    beams: Float[Array, "N 2"]  # unit vectors
-    ranges: Float[Array, " N"]  # m
+    lines: Lines
+    """Lines in the frame of the robot, with covariances of the measurement alone."""
+    circles: Circles
+    """Circles, likewise."""
+    collinear: Bool[Array, "L L"]
+    """Which lines may be pieces of one."""
+    points: Float[Array, "N 2"]
+    """Points in the frame of the robot, m."""
+    beams: Float[Array, "N 2"]
+    """Unit vectors along the beams."""
+    ranges: Float[Array, " N"]
+    """Measured ranges, m."""
     returned: Bool[Array, " N"]
-    alone: Bool[Array, " N"]  # returned, and in no line nor fitted circle
-    laser: Float[Array, "2"]  # m
+    """Which beams came back."""
+    alone: Bool[Array, " N"]
+    """Returned, and in no line nor fitted circle."""
+    laser: Float[Array, "2"]
+    """The scanner, m."""
 
 
 @pytree
 class Sightings:
     """y = H error + A e + v for some primitives of the map. Free slots hold zeros, and a covariance of ones."""
 
-    slot: Int[Array, " S"]  # of the map; lines first, then circles
-    innovation: Float[Array, "S 2"]  # y, seen minus expected: of (offset, angle) of a line, of the centre of a circle
-    jac_pose: Float[Array, "S 2 3"]  # H
-    by_map: Float[Array, "S 2 2"]  # A
-    cov: Float[Array, "S 2 2"]  # of v
+    slot: Int[Array, " S"]
+    """Slot in the map; lines first, then circles."""
+    innovation: Float[Array, "S 2"]
+    """y, seen minus expected: of (offset, angle) of a line, of the centre of a circle."""
+    jac_pose: Float[Array, "S 2 3"]
+    """H, derivative of the expectation by the pose."""
+    by_map: Float[Array, "S 2 2"]
+    """A, how the errors of the map's primitive enter, each in units of its sigma."""
+    cov: Float[Array, "S 2 2"]
+    """Covariance of v, the noise of the sighting."""
     valid: Bool[Array, " S"]
+    """Which slots are in use."""
 
 
 def believe(pose: Pose, line_map: LineMap) -> Belief:
-    """The belief to begin with: a pose that owes nothing to the map, and no opinion of how well the map fits."""
+    """The belief to begin with: a pose that owes nothing to the map, and no opinion of how well the map fits.
+
+    Args:
+      pose: of the robot, in the map.
+      line_map: the map, whose capacity decides the shape.
+
+    Returns:
+      The belief before the first scan.
+    """
     primitives = line_map.lines.valid.shape[0] + line_map.circles.valid.shape[0]
     dtype = pose.mean.dtype
     return Belief(
@@ -257,7 +292,17 @@ def localize(
 
 
 def predict(belief: Belief, step: Float[Array, "3"], extra: Float[Array, "3"], odometry: OdometryNoise) -> Belief:
-    """The belief after a step by the robot's odometry: what the map has done to the pose moves along."""
+    """The belief after a step by the robot's odometry: what the map has done to the pose moves along.
+
+    Args:
+      belief: before the step.
+      step: seen from the pose before, as the wheels count it. m, m, rad. Shape `[3]`.
+      extra: variances that come on top of those of the step. m^2, m^2, rad^2. Shape `[3]`.
+      odometry: noise of the wheels.
+
+    Returns:
+      The belief after the step.
+    """
     by_pose, by_step = jac_compose_pose(belief.mean, step), jac_compose_step(belief.mean, step)
     return dataclasses.replace(
         belief,
@@ -278,7 +323,21 @@ def observe(
     jacobians: Jacobians = "analytic",
     **options: Any,
 ) -> Seen:
-    """Lines, circles and points of a scan in the frame of the robot, whatever its pose."""
+    """Lines, circles and points of a scan in the frame of the robot, whatever its pose.
+
+    Args:
+      scan: `N` beams.
+      mount: of the scanner on the robot.
+      thresholds: criteria of the extraction.
+      noise: of the sensor.
+      capacity: slots for lines and circles.
+      rules: which reading of the method.
+      jacobians: "autodiff" or "analytic".
+      **options: the remaining ones of `extract`.
+
+    Returns:
+      What the scan holds; covariances are those of the measurement alone.
+    """
     dtype = scan.ranges.dtype
     scan, here, _ = usable(scan, Pose(mean=jnp.zeros(3, dtype), cov=jnp.zeros((3, 3), dtype)))
     found = extract(
@@ -333,6 +392,9 @@ def locate(
       rules: which reading of the method.
       noise: of the sensor.
       settings: thresholds of the filter.
+
+    Returns:
+      The belief, with the pose improved and the map's part in it carried along; and what was used.
     """
     dtype = belief.mean.dtype
     cov = belief.cov
@@ -440,6 +502,9 @@ def sight_lines(
       thresholds: `match_...`.
       rules: which reading of the method.
       settings: the floors.
+
+    Returns:
+      A sighting for each line of the scan; not valid for those that match no line of the map.
     """
     new, jac = place(seen.lines, pose, cov)
     matches = match_lines(new, model, seen.collinear, thresholds, rules, "independent")
@@ -464,6 +529,9 @@ def place(lines: Lines, pose: Float[Array, "3"], cov: Float[Array, "3 3"]) -> tu
       lines: in the frame of the robot, with covariances of the measurement alone.
       pose: of the robot.
       cov: of the pose.
+
+    Returns:
+      The lines, with the pose error in `sqrt_persistent`; d(offset, angle) / d(x, y, theta), shape `[K, 2, 3]`.
     """
     lever = jax.vmap(lambda a: rotate(pose[2], a))(lines.anchor)
     angle = wrap_angle(lines.angle + pose[2])
@@ -482,6 +550,9 @@ def jac_line_pose(lines: Lines, lever: Float[Array, "K 2"]) -> Float[Array, "K 2
     Args:
       lines: in the world.
       lever: from the robot to their anchors, in the axes of the world, m.
+
+    Returns:
+      d(offset, angle) / d(x, y, theta). Shape `[K, 2, 3]`.
     """
     zero, one = jnp.zeros_like(lines.offset), jnp.ones_like(lines.offset)
     normal = lines.normal
@@ -501,6 +572,17 @@ def sight_circles(
 
     Circles that are not fitted describe what is visible of a cluster, which moves with the viewpoint by more than what
     there is to gain: they take part in the search alone.
+
+    Args:
+      seen: what the scan holds.
+      pose: from which it is taken to be seen. m, m, rad.
+      cov: of that pose. m^2, m rad, rad^2.
+      model: the circles of the map.
+      first: slot of the first circle among the sightings: the number of lines of the map.
+      settings: `match_nis` and `offset_floor`.
+
+    Returns:
+      A sighting for each circle of the scan; not valid for those that match none of the map.
     """
     circles = seen.circles
     lever = jax.vmap(lambda a: rotate(pose[2], a))(circles.center)
@@ -544,6 +626,9 @@ def sight_points(
       model: the lines of the map.
       noise: of the sensor.
       settings: `point_distance` and the floors.
+
+    Returns:
+      Sightings of lines of the map, by groups of points; not valid where there is no such group.
     """
     towards = jax.vmap(lambda a: rotate(pose[2], a))(seen.beams)
     points = pose[None, :2] + jax.vmap(lambda a: rotate(pose[2], a))(seen.points)
@@ -599,7 +684,15 @@ def _beside(
 
 
 def innovation_cov(belief: Belief, sightings: Sightings) -> Float[Array, "S 2 2"]:
-    """Covariance of each innovation by itself, H C H' + A A' + V and what pose and map have in common."""
+    """Covariance of each innovation by itself, H C H' + A A' + V and what pose and map have in common.
+
+    Args:
+      belief: predicted.
+      sightings: `S` of them.
+
+    Returns:
+      Of (offset, angle) of lines: m^2, m rad, rad^2; of the centres of circles: m^2. Shape `[S, 2, 2]`.
+    """
     moved = jnp.moveaxis(belief.by_map[:, sightings.slot], 0, 1)
     common = product(product(sightings.jac_pose, moved), jnp.swapaxes(sightings.by_map, -1, -2))
     of_pose = propagate(sightings.jac_pose, belief.cov)
@@ -607,7 +700,16 @@ def innovation_cov(belief: Belief, sightings: Sightings) -> Float[Array, "S 2 2"
 
 
 def gated(belief: Belief, sightings: Sightings, most: Number) -> Sightings:
-    """The sightings whose normalised innovation squared is less than `most`."""
+    """The sightings whose normalised innovation squared is less than `most`.
+
+    Args:
+      belief: predicted.
+      sightings: `S` of them.
+      most: the gate, a quantile of chi-square with 2 degrees of freedom.
+
+    Returns:
+      The sightings; those beyond the gate are not valid.
+    """
     nis = quadratic(sightings.innovation, inverse(innovation_cov(belief, sightings)))
     return _where(
         sightings.valid & (nis < most),
@@ -696,6 +798,16 @@ def fit_of_scan(
 
     What the map lacks makes returns nearer than it would have them, and speaks neither for nor against a pose. A return
     from behind a line that was seen often speaks against it.
+
+    Args:
+      seen: what the scan holds.
+      pose: of the robot, from which it is judged. m, m, rad.
+      lines: those of the map, directed.
+      field: of the map.
+      settings: `explained_distance` and `through_distance`.
+
+    Returns:
+      From -1, all of it contradicts, to 1, all of it is explained; 0 without a return.
     """
     points, valid = thinned(seen.points, seen.returned)
     ranges, _ = thinned(seen.ranges[:, None], seen.returned)

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from linemap_jax.core.estimation.registration import RegistrationSettings, register
 from linemap_jax.core.estimation.surface import Surface, seen_from
+from linemap_jax.core.fields import documented
 from linemap_jax.core.frames import wrap_angle
 from linemap_jax.core.settings import Number
 from linemap_jax.core.state import pytree
@@ -61,17 +62,31 @@ class LoopSettings:
     """What is another direction, rad."""
 
 
+@documented
 class Closure(NamedTuple):
     """What a keyframe says of an older one."""
 
-    step: Float[Array, "3"]  # pose of the newer one, seen from the older. m, m, rad
-    information: Float[Array, "3 3"]  # as if the points' errors were independent
-    share: Float[Array, ""]  # of the points, those that agree
+    step: Float[Array, "3"]
+    """Pose of the newer one, seen from the older. m, m, rad."""
+    information: Float[Array, "3 3"]
+    """Information on the step, as if the points' errors were independent."""
+    share: Float[Array, ""]
+    """Share of the points that agree."""
     believed: Bool[Array, ""]
+    """Whether the two keyframes are taken to see one place."""
 
 
 def joined(surfaces: Surface, poses: Float[Array, "S 3"], valid: Bool[Array, " S"]) -> Surface:
-    """Several surfaces in one frame, that in which the poses are given. `[S, M]` in, `[S * M]` out."""
+    """Several surfaces in one frame, that in which the poses are given. `[S, M]` in, `[S * M]` out.
+
+    Args:
+      surfaces: `S` of them, stacked, of `M` points each.
+      poses: of their frames. m, m, rad. Shape `[S, 3]`.
+      valid: which of them there are. Shape `[S]`.
+
+    Returns:
+      One surface of `S * M` points.
+    """
 
     def moved(surface: Surface, pose: Array, is_there: Array) -> Surface:
         surface = seen_from(surface, pose)
@@ -81,7 +96,7 @@ def joined(surfaces: Surface, poses: Float[Array, "S 3"], valid: Bool[Array, " S
 
 
 def thinned(surface: Surface) -> Surface:
-    """Every third point."""
+    """Every third point of the `surface`."""
     return jax.tree.map(lambda x: x[::THINNING], surface)
 
 
@@ -106,6 +121,9 @@ def close_loop(
       path: shortest path between the two, m.
       settings: what is believed.
       registration: of the keyframe.
+
+    Returns:
+      The step from the older keyframe to the new one, and whether it is believed.
     """
     surface = joined(surfaces, poses, valid)
     drift = settings.least_drift + settings.drift_per_metre * path

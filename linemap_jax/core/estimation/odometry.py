@@ -54,8 +54,10 @@ class GyroscopeNoise:
 class Increment:
     """A step of the robot: its pose seen from the one before it, and the covariance."""
 
-    mean: Float[Array, "3"]  # x ahead, y to the left, turn; m, m, rad
-    cov: Float[Array, "3 3"]  # m^2, m rad, rad^2
+    mean: Float[Array, "3"]
+    """x ahead, y to the left, turn. m, m, rad."""
+    cov: Float[Array, "3 3"]
+    """Covariance of these: m^2, m rad, rad^2."""
 
 
 def increment_from_poses(
@@ -72,6 +74,9 @@ def increment_from_poses(
       after: of the later one.
       noise: of the wheels.
       jacobians: "autodiff" or "analytic".
+
+    Returns:
+      The step, seen from the earlier pose, and its covariance.
     """
     step = between(before, after)
     return Increment(mean=step, cov=cov_step(step, noise, jacobians=jacobians))
@@ -93,13 +98,25 @@ def increment_from_wheels(
       base: distance of the wheels, m.
       noise: of the wheels.
       jacobians: "autodiff" or "analytic".
+
+    Returns:
+      The step, seen from where it began, and its covariance.
     """
     step = step_from_wheels(left, right, base)
     return Increment(mean=step, cov=cov_step(step, noise, jacobians=jacobians))
 
 
 def step_from_wheels(left: Float[Array, ""], right: Float[Array, ""], base: Number) -> Float[Array, "3"]:
-    """The end of the arc: its chord has half the direction of the turn. m, m, rad."""
+    """The end of the arc: its chord has half the direction of the turn. m, m, rad.
+
+    Args:
+      left: what the left wheel has run, m.
+      right: what the right wheel has run, m.
+      base: distance of the wheels, m.
+
+    Returns:
+      x ahead, y to the left, turn. m, m, rad; the turn is not wrapped. Shape `[3]`.
+    """
     distance, turn = (left + right) / 2, (right - left) / base
     chord = distance * jnp.sinc(turn / (2 * jnp.pi))  # distance sin(turn / 2) / (turn / 2)
     return jnp.concatenate([chord * unit(turn / 2), turn[None]])
@@ -117,6 +134,9 @@ def with_gyroscope(
       turn: the angle that the gyroscope has turned through, its bias taken off, rad. Not wrapped: as the wheels' turn.
       seconds: how long the step took.
       noise: of the gyroscope.
+
+    Returns:
+      The increment, with a smaller covariance.
     """
     variance = noise.sigma_rate**2 * seconds + (noise.sigma_bias * seconds) ** 2
     of_turn = increment.cov[:, 2]
@@ -140,6 +160,9 @@ def step_with_errors(step: Float[Array, "3"], errors: Float[Array, "3"]) -> Floa
     Args:
       step: x, y, turn. m, m, rad.
       errors: along, across, turn. m, m, rad.
+
+    Returns:
+      The step that was made. m, m, rad. Shape `[3]`.
     """
     along = _direction(step)
     moved = step[:2] + errors[0] * along + errors[1] * perp(along)
@@ -147,7 +170,14 @@ def step_with_errors(step: Float[Array, "3"], errors: Float[Array, "3"]) -> Floa
 
 
 def jac_step_errors(step: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """The derivative of `step_with_errors` by errors of zero, derived by hand."""
+    """The derivative of `step_with_errors` by errors of zero, derived by hand.
+
+    Args:
+      step: x, y, turn, as counted. m, m, rad. Shape `[3]`.
+
+    Returns:
+      d(x, y, turn) / d(along, across, turn). Shape `[3, 3]`.
+    """
     along = _direction(step)
     move = jnp.stack([along, perp(along), perp(step[:2]) / 2], -1)
     return jnp.concatenate([move, jnp.eye(3, dtype=step.dtype)[2:]])
@@ -166,6 +196,9 @@ def cov_step(
       step: x, y, turn. m, m, rad.
       noise: of the wheels.
       jacobians: "autodiff" or "analytic".
+
+    Returns:
+      Of (x, y, turn): m^2, m rad, rad^2. Shape `[3, 3]`.
     """
     distance, turn = safe_sqrt(step[0] ** 2 + step[1] ** 2), jnp.abs(step[2])
     along = noise.sigma_distance_distance**2 * distance + noise.sigma_distance_turn**2 * turn

@@ -24,26 +24,34 @@ GATE_2D = 9.21
 class Beacons:
     """Beacons in the world, and where they are."""
 
-    position: Float[Array, "B 2"]  # m
+    position: Float[Array, "B 2"]
+    """Places in the world, m."""
     valid: Bool[Array, " B"]
+    """Which slots are in use."""
 
 
 @pytree
 class BeaconReadings:
     """What a sensor on the robot measured of beacons."""
 
-    measurement: Float[Array, "R 2"]  # range and bearing, in the frame of the sensor; m, rad
-    beacon: Int[Array, " R"]  # which one it is, -1 where that is not known
+    measurement: Float[Array, "R 2"]
+    """Range and bearing, in the frame of the sensor; m, rad."""
+    beacon: Int[Array, " R"]
+    """Which beacon it is, -1 where that is not known."""
     valid: Bool[Array, " R"]
+    """Which slots are in use."""
 
 
 @pytree
 class BeaconReport:
     """What became of each reading."""
 
-    beacon: Int[Array, " R"]  # the one that it was used for, -1 if it was not used
-    nis: Float[Array, " R"]  # normalised innovation squared of the best candidate, before the gate; 0 for none
-    dof: Int[Array, " R"]  # 2; 0 where nothing was compared
+    beacon: Int[Array, " R"]
+    """Beacon that it was used for, -1 if it was not used."""
+    nis: Float[Array, " R"]
+    """Normalised innovation squared of the best candidate, before the gate; 0 for none."""
+    dof: Int[Array, " R"]
+    """Degrees of freedom: 2, or 0 where nothing was compared."""
 
 
 def predict(pose: Pose, increment: Increment, *, jacobians: Jacobians = "analytic") -> Pose:
@@ -53,6 +61,9 @@ def predict(pose: Pose, increment: Increment, *, jacobians: Jacobians = "analyti
       pose: before the step.
       increment: the step, seen from that pose.
       jacobians: "autodiff" or "analytic".
+
+    Returns:
+      The pose after the step, with a larger covariance.
     """
     by_pose = jacobian(lambda x: compose(x, increment.mean), lambda x: jac_compose_pose(x, increment.mean), jacobians)
     by_step = jacobian(lambda x: compose(pose.mean, x), lambda x: jac_compose_step(pose.mean, x), jacobians)
@@ -87,6 +98,14 @@ def jac_beacon_pose(
 
     With the ray from the sensor to the beacon, r its length and e its direction in the world: the range falls by e when
     the sensor moves, and the bearing by perp(e) / r; a turn of the robot moves the sensor by its turned mount.
+
+    Args:
+      pose: (x, y, theta) of the robot. m, m, rad. Shape `[3]`.
+      beacon: its position in the world, m. Shape `[2]`.
+      mount: (x, y, theta) of the sensor on the robot. m, m, rad. Shape `[3]`.
+
+    Returns:
+      d(range, bearing) / d(x, y, theta). Shape `[2, 3]`.
     """
     lever = rotate(pose[2], mount[:2])
     ray = beacon - pose[:2] - lever
@@ -152,6 +171,9 @@ def update_by_beacons(
       mount: of the sensor on the robot.
       gate: largest normalised innovation squared of a reading that is used.
       jacobians: "autodiff" or "analytic".
+
+    Returns:
+      The pose after all of them, and which beacon each reading was used for.
     """
     dtype = pose.mean.dtype
     at = jnp.stack([jnp.asarray(mount.x), jnp.asarray(mount.y), jnp.asarray(mount.theta)]).astype(dtype)

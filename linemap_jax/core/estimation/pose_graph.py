@@ -54,23 +54,34 @@ class RegistrationError:
 class Closures:
     """Steps between keyframes that do not follow one another."""
 
-    begin: Int[Array, " E"]  # the older keyframe
-    end: Int[Array, " E"]  # the newer
-    step: Float[Array, "E 3"]  # pose of the newer, seen from the older. m, m, rad
+    begin: Int[Array, " E"]
+    """The older keyframe."""
+    end: Int[Array, " E"]
+    """The newer."""
+    step: Float[Array, "E 3"]
+    """Pose of the newer, seen from the older. m, m, rad."""
     cov: Float[Array, "E 3 3"]
-    weight: Float[Array, " E"]  # from 0, not believed, to 1, which new ones begin with
+    """Covariance of the step: m^2, m rad, rad^2."""
+    weight: Float[Array, " E"]
+    """Weight, from 0, not believed, to 1, which new ones begin with."""
     valid: Bool[Array, " E"]
+    """Which slots are in use."""
 
 
 @pytree
 class PoseGraph:
     """Keyframes in the order in which they were passed. The first one is held where it is."""
 
-    poses: Float[Array, "N 3"]  # m, m, rad
-    step: Float[Array, "N 3"]  # from the keyframe before; of the first, of no meaning
+    poses: Float[Array, "N 3"]
+    """Poses of the keyframes. m, m, rad."""
+    step: Float[Array, "N 3"]
+    """Step from the keyframe before, m, m, rad; of the first, of no meaning."""
     cov_step: Float[Array, "N 3 3"]
+    """Covariance of the step: m^2, m rad, rad^2."""
     valid: Bool[Array, " N"]
+    """Which slots are in use."""
     closures: Closures
+    """Steps between keyframes that do not follow each other."""
 
 
 def cov_of_registration(
@@ -79,13 +90,16 @@ def cov_of_registration(
     prior: Float[Array, "*s 3 3"],
     error: RegistrationError = RegistrationError(),
 ) -> Float[Array, "*s 3 3"]:
-    """Covariance of a step that registration has found.
+    """Covariance of a step (x, y, theta) that registration has found: m^2, m rad, rad^2.
 
     Args:
-      information: of its points, as if their errors were independent.
+      information: of its points, as if their errors were independent: 1/m^2, 1/(m rad), 1/rad^2.
       share: of the scan's points, those that agree.
-      prior: what is known of the step without them, as information.
+      prior: what is known of the step without them, as information, likewise.
       error: how far they are believed.
+
+    Returns:
+      The covariance. Shape `[*s, 3, 3]`.
     """
     trust = jnp.clip((share - error.no_trust) / (error.full_trust - error.no_trust), 0, 1)
     weight = (error.point_weight * trust)[..., None, None]

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from linemap_jax.core.estimation.surface import Surface, seen_from
+from linemap_jax.core.fields import documented
 from linemap_jax.core.frames import dot, perp, wrap_angle
 from linemap_jax.core.propagation import apply, inverse
 from linemap_jax.core.settings import Number
@@ -38,12 +39,16 @@ class RegistrationSettings:
     """Points nearer than this to the surface agree with it, m."""
 
 
+@documented
 class Registration(NamedTuple):
     """A scan laid onto a surface."""
 
-    pose: Float[Array, "3"]  # m, m, rad
-    information: Float[Array, "3 3"]  # from the points alone, as if their errors were independent
-    share: Float[Array, ""]  # of the scan's points, those that agree with the surface
+    pose: Float[Array, "3"]
+    """Pose of the scan in the frame of the surface. m, m, rad."""
+    information: Float[Array, "3 3"]
+    """Information on the pose from the points alone, as if their errors were independent."""
+    share: Float[Array, ""]
+    """Share of the scan's points that agree with the surface."""
 
 
 def register(
@@ -122,6 +127,14 @@ def nearest(points: Float[Array, "M 2"], others: Float[Array, "K 2"], valid: Boo
     In float32, where the squared distances of two are equal but for their last bits, either of them. The bits of a
     positive number rise with it, so that index and distance fit into one integer, whose minimum is one kernel; an
     `argmin` goes number by number.
+
+    Args:
+      points: m. Shape `[M, 2]`.
+      others: m. Shape `[K, 2]`.
+      valid: which of the others count. Shape `[K]`.
+
+    Returns:
+      For each point the index of the nearest of the others. Shape `[M]`.
     """
     bits = (others.shape[0] - 1).bit_length()
     square = (points[None, :, 0] - others[:, None, 0]) ** 2 + (points[None, :, 1] - others[:, None, 1]) ** 2

@@ -22,10 +22,14 @@ _FLATNESS = 0.1  # largest ratio of the two principal variances of a piece of wa
 class Surface:
     """Points of a surface, in some frame."""
 
-    position: Float[Array, "M 2"]  # m
-    normal: Float[Array, "M 2"]  # unit vector, towards the scanner; of no meaning unless flat
-    flat: Bool[Array, " M"]  # whether the neighbours of the point lie on one line with it
+    position: Float[Array, "M 2"]
+    """Points, m."""
+    normal: Float[Array, "M 2"]
+    """Unit vector, towards the scanner; of no meaning unless flat."""
+    flat: Bool[Array, " M"]
+    """Whether the neighbours of the point lie on one line with it."""
     valid: Bool[Array, " M"]
+    """Which slots are in use."""
 
 
 def surface_of_scan(scan: Scan, points: int = POINTS) -> Surface:
@@ -36,6 +40,9 @@ def surface_of_scan(scan: Scan, points: int = POINTS) -> Surface:
     Args:
       scan: `N` beams.
       points: slots for points; as many beams are used at most, evenly spread.
+
+    Returns:
+      The surface, with as many slots as beams are used.
     """
     thinned = slice(None, None, -(-scan.ranges.shape[0] // points))
     empty = (0, points - scan.ranges[thinned].shape[0])
@@ -65,7 +72,7 @@ def surface_of_scan(scan: Scan, points: int = POINTS) -> Surface:
 
 
 def seen_from(surface: Surface, pose: Float[Array, "3"]) -> Surface:
-    """A surface in the frame of `pose`, as it is in the frame in which the pose is given. m, m, rad."""
+    """The `surface` in the frame of `pose`, as it is in the frame in which the pose is given. m, m, rad."""
     turned = jnp.stack([unit(pose[2]), perp(unit(pose[2]))], -1)
     return dataclasses.replace(
         surface, position=pose[None, :2] + surface.position @ turned.T, normal=surface.normal @ turned.T
@@ -73,6 +80,9 @@ def seen_from(surface: Surface, pose: Float[Array, "3"]) -> Surface:
 
 
 def middle_of(surface: Surface, reach: float = 10.0) -> Float[Array, "2"]:
-    """The mean of the points within `reach` metres of the scanner: what the scan looks at. Zero if there is none."""
+    """The mean of the points of a `surface` within `reach` metres of the scanner, m: what the scan looks at.
+
+    Zero if there is none.
+    """
     near = surface.valid & (dot(surface.position, surface.position) < reach**2)
     return jnp.sum(jnp.where(near[:, None], surface.position, 0), 0) / jnp.maximum(jnp.sum(near), 1)

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from linemap_jax.core.estimation.odometry import OdometryNoise, cov_step
 from linemap_jax.core.estimation.registration import Registration, RegistrationSettings, register
 from linemap_jax.core.estimation.surface import Surface, seen_from, surface_of_scan
+from linemap_jax.core.fields import documented
 from linemap_jax.core.frames import between, compose, unit
 from linemap_jax.core.propagation import inverse, propagate
 from linemap_jax.core.settings import Number
@@ -49,28 +50,50 @@ class TrackingSettings:
 class Track:
     """What the front end carries from scan to scan."""
 
-    odometry: Float[Array, "3"]  # m, m, rad; of the last scan, as the log has it
-    pose: Float[Array, "3"]  # of the scanner at the last scan, in the frame in which odometry began
-    step: Float[Array, "3"]  # to there, from the scan before
-    keyframe: Float[Array, "3"]  # pose of the last keyframe
-    surface: Surface  # [KEYFRAMES * M] of the last keyframes, about the last one's position, in the world's axes
-    count: Int[Array, ""]  # of keyframes so far
+    odometry: Float[Array, "3"]
+    """Odometry of the last scan, as the log has it. m, m, rad."""
+    pose: Float[Array, "3"]
+    """Pose of the scanner at the last scan, in the frame in which odometry began. m, m, rad."""
+    step: Float[Array, "3"]
+    """Step to there, from the scan before. m, m, rad."""
+    keyframe: Float[Array, "3"]
+    """Pose of the last keyframe. m, m, rad."""
+    surface: Surface
+    """What the last keyframes have seen, `KEYFRAMES * M` points about the last one's position, in the world's axes."""
+    count: Int[Array, ""]
+    """Number of keyframes so far."""
 
 
+@documented
 class Tracked(NamedTuple):
     """What the front end says of a scan."""
 
-    pose: Float[Array, "3"]  # of the scanner, in the frame in which odometry began. m, m, rad
+    pose: Float[Array, "3"]
+    """Pose of the scanner, in the frame in which odometry began. m, m, rad."""
     is_keyframe: Bool[Array, ""]
-    step: Float[Array, "3"]  # from the last keyframe before it, seen from there
-    information: Float[Array, "3 3"]  # on the step, as if the points' errors were independent
-    odometry: Float[Array, "3"]  # the step that odometry has counted from the last scan to this
-    share: Float[Array, ""]  # of the points, those that agree with what was seen before
-    surface: Surface  # [M] in the frame of the scanner
+    """Whether the scan is one."""
+    step: Float[Array, "3"]
+    """Step from the last keyframe before it, seen from there. m, m, rad."""
+    information: Float[Array, "3 3"]
+    """Information on the step, as if the points' errors were independent."""
+    odometry: Float[Array, "3"]
+    """The step that odometry has counted from the last scan to this. m, m, rad."""
+    share: Float[Array, ""]
+    """Share of the points that agree with what was seen before."""
+    surface: Surface
+    """What the scan has seen, `M` points in the frame of the scanner."""
 
 
 def begin_track(odometry: Float[Array, "3"], scan: Scan) -> Track:
-    """A track before its first scan. Shapes and dtype are those of the scan."""
+    """A track before its first scan. Shapes and dtype are those of the scan.
+
+    Args:
+      odometry: pose of the scanner by the robot's odometry at the first scan. m, m, rad. Shape `[3]`.
+      scan: the first scan, of which shape and dtype count.
+
+    Returns:
+      The state for `track`.
+    """
     blank = jax.eval_shape(surface_of_scan, scan)
     surface = jax.tree.map(lambda x: jnp.zeros((KEYFRAMES * x.shape[0], *x.shape[1:]), x.dtype), blank)
     zero = jnp.zeros(3, scan.ranges.dtype)
@@ -98,6 +121,9 @@ def track(
       noise: of the odometry.
       settings: keyframes, and trust in odometry.
       registration: of the scan.
+
+    Returns:
+      The state after the scan, and what there is to say of it.
     """
     counted = between(state.odometry, odometry)
     surface = surface_of_scan(scan)

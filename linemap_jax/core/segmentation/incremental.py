@@ -1,4 +1,4 @@
-"""Section 4.3.1: the paper's three criteria, one pass over the points.
+"""Section 4.3.1 (lines): the paper's three criteria, one pass over the points.
 
 A point joins the current run while (1) it is near the previous point, (2) it is near the run's line and (3) its bearing
 is near the previous one. The running sums of Eq. (5) start anew at each run's first point: in coordinates of the world
@@ -13,22 +13,32 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
+from linemap_jax.core.fields import documented
 from linemap_jax.core.frames import dot
 from linemap_jax.core.sensor import Points
 from linemap_jax.core.settings import Number, Rules, SensorNoise, Thresholds
 
 
+@documented
 class Run(NamedTuple):
     """The run under extraction, as it stands at some point; the running sums of Eq. (5) are from its first point."""
 
-    n: Array  # number of points
-    x0: Array  # first point
+    n: Array
+    """Number of points."""
+    x0: Array
+    """First point, x, m."""
     y0: Array
+    """First point, y, m."""
     rx: Array
+    """R_x of Eq. (5), from the first point, m."""
     ry: Array
+    """R_y, m."""
     rxx: Array
+    """R_xx, m^2."""
     ryy: Array
+    """R_yy, m^2."""
     rxy: Array
+    """R_xy, m^2."""
 
 
 class _Step(NamedTuple):
@@ -111,6 +121,9 @@ def follow(
       points: the points of the scan.
       gap: the largest distance between them, m, by the arc between their beams, m.
       beams: the largest angle between them, in beam spacings.
+
+    Returns:
+      Whether criterion 1 holds, and whether criterion 3 does. Shapes `[N]`.
     """
     step = points.position - one_before(points.position)
     arc = jnp.minimum(points.range, one_before(points.range)) * points.turn
@@ -119,12 +132,21 @@ def follow(
 
 
 def one_before(x: Shaped[Array, "N *s"]) -> Shaped[Array, "N *s"]:
-    """What stands before each; the first for the first."""
+    """What stands before each of `x`; the first for the first."""
     return jnp.concatenate([x[:1], x[:-1]])
 
 
 def gap_gate(arc: Float[Array, "*s"], thresholds: Thresholds, noise: SensorNoise) -> Float[Array, "*s"]:
-    """Criterion 1: the largest distance between successive points, in metres, by the arc between their beams."""
+    """Criterion 1: the largest distance between successive points, in metres, by the arc between their beams.
+
+    Args:
+      arc: between the beams of the two points, at the nearer one: range times angle, m.
+      thresholds: `gap_distance`, `gap_spacings`, `gap_sigmas`.
+      noise: of the range.
+
+    Returns:
+      The gate, m; of the shape of the arcs.
+    """
     noisy = thresholds.gap_sigmas * math.sqrt(2) * noise.range_sigma
     return jnp.maximum(jnp.maximum(thresholds.gap_distance, thresholds.gap_spacings * arc), noisy)
 

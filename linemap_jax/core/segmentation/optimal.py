@@ -49,14 +49,22 @@ LEAST_RING = 8
 class Segmented:
     """The runs of a scan, and with a budget the lines of its polyline."""
 
-    points: Points  # those of the scan; of a closed ring, in the order from where it was cut open
-    ends: Bool[Array, " N"]  # the last points of runs
-    run: Run  # at the last point of a run, its sums
-    on_line: Bool[Array, " N"]  # false for points that are left to the circles
-    goes_on: Bool[Array, " N"]  # the last points of runs behind which the next one begins, without a gap
-    breaks: Int[Array, "3"]  # how many points broke a run by criteria 1, 2 and 3
-    begin: Float[Array, "V 2"]  # m, of the lines of the polyline, in the coordinates of the points
+    points: Points
+    """Points of the scan; of a closed ring, in the order from where it was cut open."""
+    ends: Bool[Array, " N"]
+    """The last points of runs."""
+    run: Run
+    """At the last point of a run, its sums."""
+    on_line: Bool[Array, " N"]
+    """False for points that are left to the circles."""
+    goes_on: Bool[Array, " N"]
+    """The last points of runs behind which the next one begins, without a gap."""
+    breaks: Int[Array, "3"]
+    """How many points broke a run by criteria 1, 2 and 3."""
+    begin: Float[Array, "V 2"]
+    """Begin points of the lines of the polyline, in the coordinates of the points, m."""
     end: Float[Array, "V 2"]
+    """Their other end points, m."""
 
 
 def segment(points: Points, thresholds: Thresholds, noise: SensorNoise, *, max_vertices: int | None) -> Segmented:
@@ -71,6 +79,9 @@ def segment(points: Points, thresholds: Thresholds, noise: SensorNoise, *, max_v
       thresholds: criteria 1 and 3, and `line_sigmas`; not used with a budget, save that there is one.
       noise: of the sensor.
       max_vertices: the largest number of vertices; None lets the criterion decide.
+
+    Returns:
+      The points, and which of them end runs.
 
     Raises:
       ValueError: at trace time, if the budget is not a whole number of two or more.
@@ -100,6 +111,9 @@ def priced(
       follows: whether a line may hold a point and the one before.
       thresholds: `line_sigmas`.
       noise: of the sensor.
+
+    Returns:
+      The sweep, whose residuals count in sigmas; the price of a vertex, on the same scale.
     """
     angle, one = _angle(points), jnp.ones_like(points.range)
     sweep = Sweep(
@@ -232,7 +246,7 @@ def _by_budget(points: Points, noise: SensorNoise, max_vertices: int) -> Segment
 
 
 def budget_gap(arc: Float[Array, "*s"]) -> Float[Array, "*s"]:
-    """With a budget, the largest distance between successive points, m, by the arc between their beams."""
+    """With a budget, the largest distance between successive points, m, by the `arc` between their beams, m."""
     return jnp.maximum(BUDGET_GAP_DISTANCE, BUDGET_GAP_SPACINGS * arc)
 
 
@@ -308,6 +322,14 @@ def lines_of_polyline(lines: Lines, segmented: Segmented, pose: Pose) -> Lines:
     """The lines of the runs, laid through the vertices of the polyline.
 
     Their covariances remain those of the most likely lines of the same points.
+
+    Args:
+      lines: of the runs, from `measure_lines`.
+      segmented: by `segment` with a budget.
+      pose: of the robot.
+
+    Returns:
+      The lines with other offsets, angles and end points.
     """
     slot = jnp.minimum(jnp.arange(lines.valid.shape[0]), segmented.begin.shape[0] - 1)
     begin, end = segmented.begin[slot], segmented.end[slot]
@@ -329,7 +351,17 @@ def lines_of_polyline(lines: Lines, segmented: Segmented, pose: Pose) -> Lines:
 
 
 def join_corners(lines: Lines, runs: Runs, segmented: Segmented, pose: Pose) -> Lines:
-    """Let neighbouring lines end where they cross, if that is between the last beam of one and the other's first."""
+    """Let neighbouring lines end where they cross, if that is between the last beam of one and the other's first.
+
+    Args:
+      lines: of the runs, in the order of the sweep.
+      runs: their points.
+      segmented: by `segment`.
+      pose: of the robot.
+
+    Returns:
+      The lines with other end points.
+    """
     points = segmented.points
     count = lines.valid.shape[0]
     behind = jnp.minimum(jnp.arange(count) + 1, count - 1)

@@ -55,13 +55,20 @@ LEFT, INSIDE, BEGIN, CORNER, END = range(5)
 class Sweep:
     """What the search has to know of the points, in the order of the sweep."""
 
-    angle: Float[Array, " N"]  # rad, from the first beam, growing
-    range: Float[Array, " N"]  # m
-    weight: Float[Array, " N"]  # of a residual, 1/m
-    price: Float[Array, " N"]  # of leaving the point out
-    follows: Bool[Array, " N"]  # a line may hold the point and the one before
-    again: Bool[Array, " N"]  # the last point of a ring, which is the first one once more, and counts as none
+    angle: Float[Array, " N"]
+    """Angle from the first beam, growing, rad."""
+    range: Float[Array, " N"]
+    """Ranges, m."""
+    weight: Float[Array, " N"]
+    """Weight of a residual, 1/m."""
+    price: Float[Array, " N"]
+    """Price of leaving the point out."""
+    follows: Bool[Array, " N"]
+    """Whether a line may hold the point and the one before."""
+    again: Bool[Array, " N"]
+    """The last point of a ring, which is the first one once more, and counts as none."""
     valid: Bool[Array, " N"]
+    """Which slots are in use."""
 
 
 class _Start(NamedTuple):
@@ -332,11 +339,16 @@ def _observe(fit: _Fit, c: Array, s: Array, inverse: Array, weight: Array) -> _F
 class Polyline:
     """Vertices of a polyline in `V` slots, in the order of the sweep; chains of them are lines."""
 
-    angle: Float[Array, " V"]  # rad, from the first point
-    inverse: Float[Array, " V"]  # 1/m
+    angle: Float[Array, " V"]
+    """Angle from the first point, rad."""
+    inverse: Float[Array, " V"]
+    """1/r there, 1/m."""
     valid: Bool[Array, " V"]
-    is_begin: Bool[Array, " V"]  # no line before
-    is_end: Bool[Array, " V"]  # no line behind
+    """Which slots are in use."""
+    is_begin: Bool[Array, " V"]
+    """Whether no line is before."""
+    is_end: Bool[Array, " V"]
+    """Whether no line is behind."""
 
 
 def refine(

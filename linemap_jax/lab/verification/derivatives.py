@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from linemap_jax.core import circles, fusion, likelihood, lines, sensor
 from linemap_jax.core.estimation import pose_filter
+from linemap_jax.core.fields import documented
 from linemap_jax.core.frames import compose, jac_compose_pose, jac_compose_step
 from linemap_jax.core.matching import CircleMatches
 from linemap_jax.core.propagation import product
@@ -33,40 +34,69 @@ STEP = 2e-4
 """Of central differences of fourth order, m or rad: it is small beside a line, and large beside rounding at 10 km."""
 
 
+@documented
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Derivative:
     """A derivative of the paper. Each function takes the `x` of a case and what else the case gives."""
 
     name: str
-    estimate: Callable[..., Array]  # of the pipeline
-    analytic: Callable[..., Array] | None = None  # as the pipeline uses it; None where it needs no derivative
-    autodiff: Callable[..., Array] | None = None  # likewise, with jacobians="autodiff"
-    branch: Callable[..., tuple[Array, ...]] | None = None  # what the pipeline chose; goes on to NumPy
-    model: Callable[..., np.ndarray]  # the estimate in NumPy, with the branch held fixed
-    literal: Callable[..., np.ndarray]  # the derivative in NumPy
-    angle: int | None = None  # which number of the estimate is an angle
-    split: int = 0  # variables before and from here on are compared apart: one kind must not hide in the other's norm
+    """What the entry is called."""
+    estimate: Callable[..., Array]
+    """The estimate of the pipeline."""
+    analytic: Callable[..., Array] | None = None
+    """Its derivative as the pipeline uses it; None where it needs no derivative."""
+    autodiff: Callable[..., Array] | None = None
+    """Likewise, with jacobians="autodiff"."""
+    branch: Callable[..., tuple[Array, ...]] | None = None
+    """What the pipeline chose; goes on to NumPy."""
+    model: Callable[..., np.ndarray]
+    """The estimate in NumPy, with the branch held fixed."""
+    literal: Callable[..., np.ndarray]
+    """The derivative in NumPy."""
+    angle: int | None = None
+    """Which number of the estimate is an angle."""
+    split: int = 0
+    """Variables before and from here on are compared apart: one kind must not hide in the other's norm."""
     cases: Callable[[np.random.Generator], Iterator[Case]]
-    applies: Callable[..., bool] = lambda *_: True  # to the branch of a case
+    """The inputs it is checked on."""
+    applies: Callable[..., bool] = lambda *_: True
+    """Whether it is meant for the branch of a case."""
 
 
+@documented
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Agreement:
     """What one case has shown: largest differences, relative to the norm of the row of the Jacobian."""
 
     name: str
+    """Name of the derivative."""
     case: str
-    finite: bool  # no derivative holds a NaN or an infinity
-    estimate: float = 0.0  # the pipeline's from NumPy's, relative to the larger of it and 1 (m, rad)
-    analytic: float | None = None  # the pipeline's hand-derived one, from forward and from reverse mode
-    autodiff: float | None = None  # the pipeline's autodiff, from forward mode
-    literal: float = 0.0  # the one typed in NumPy, from forward mode and from the pipeline's hand-derived one
-    reverse: float = 0.0  # forward from reverse mode
-    central: float = 0.0  # central differences, from forward mode
+    """Name of the input."""
+    finite: bool
+    """Whether no derivative holds a NaN or an infinity."""
+    estimate: float = 0.0
+    """Difference of the pipeline's estimate from NumPy's, relative to the larger of it and 1 (m, rad)."""
+    analytic: float | None = None
+    """Difference of the pipeline's hand-derived derivative from forward and from reverse mode."""
+    autodiff: float | None = None
+    """Difference of the pipeline's autodiff from forward mode."""
+    literal: float = 0.0
+    """Difference of the one typed in NumPy from forward mode and from the pipeline's hand-derived one."""
+    reverse: float = 0.0
+    """Difference of forward from reverse mode."""
+    central: float = 0.0
+    """Difference of central differences from forward mode."""
 
 
 def check_derivatives(seed: int = 0) -> list[Agreement]:
-    """Hold every derivative of the registry against the others, in float64, on random and on nasty inputs."""
+    """Hold every derivative of the registry against the others, in float64, on random and on nasty inputs.
+
+    Args:
+      seed: of the random inputs.
+
+    Returns:
+      How far each derivative is from the others, for each case.
+    """
     with jax.enable_x64(True):
         return [found for entry in DERIVATIVES for found in check(entry, np.random.default_rng(seed))]
 

@@ -10,13 +10,21 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 import linemap_jax.core
-from linemap_jax.lab.verification.equations import Check, Row
+from linemap_jax.lab.verification.rows import Check, Row
 
 CORE = linemap_jax.core.__name__
 
 
 def as_text(rows: Iterable[Row], *, width: int = 100) -> str:
-    """The table for a terminal: the numbers of each equation, and below them where it lives and the sentence."""
+    """The table for a terminal: the numbers of each equation, and below them where it lives and the sentence.
+
+    Args:
+      rows: of `verify`.
+      width: of the terminal, in characters.
+
+    Returns:
+      The table, over several lines.
+    """
     lines = [f"{'equation':10}{'verdict':12}{'difference':>12}{'as printed':>12}  what it is"]
     for row in rows:
         printed = "" if row.as_printed is None else f"{row.as_printed.value:.2g}"
@@ -29,7 +37,14 @@ def as_text(rows: Iterable[Row], *, width: int = 100) -> str:
 
 
 def as_markdown(rows: Iterable[Row]) -> str:
-    """The table for a page. Its numbers are bounds, so that it is the same on every machine."""
+    """The table for a page. Its numbers are bounds, so that it is the same on every machine.
+
+    Args:
+      rows: of `verify`.
+
+    Returns:
+      The table in Markdown.
+    """
     lines = [
         "| equation | what it is | where it lives | difference | as printed | verdict | in a sentence |",
         "| --- | --- | --- | ---: | ---: | --- | --- |",
@@ -50,7 +65,14 @@ def as_markdown(rows: Iterable[Row]) -> str:
 
 
 def as_dict(row: Row) -> dict[str, Any]:
-    """One row for machines, with all its checks."""
+    """One row for machines, with all its checks.
+
+    Args:
+      row: of `verify`.
+
+    Returns:
+      Numbers and words for JSON.
+    """
     printed = row.as_printed
     return {
         "equation": row.equation,
