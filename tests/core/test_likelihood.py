@@ -13,7 +13,7 @@ from linemap_jax.core.sensor import points_from_scan
 from linemap_jax.core.settings import Mount, SensorNoise
 from linemap_jax.core.state import Pose, Scan
 
-RANGE, BEARING = 0.01, 0.006
+RANGE, BEARING = 0.01, 0.015
 POSE, MOUNT = np.array([5.0, -3.0, 0.4]), Mount(x=0.2, y=-0.1, theta=0.3)
 NORMAL, DISTANCE = 0.9, 1.5
 """Of the wall, from the scanner: seen at incidences from 12 to 70 degrees."""
