@@ -15,10 +15,11 @@ from linemap_jax.core.estimation.adjustment import (
     with_error_of_poses,
 )
 from linemap_jax.core.estimation.loops import LoopSettings, close_loop
+from linemap_jax.core.estimation.odometry import OdometryNoise
 from linemap_jax.core.estimation.pose_graph import Closures, PoseGraph, cov_of_registration, optimise
 from linemap_jax.core.estimation.registration import nearest, register
 from linemap_jax.core.estimation.surface import Surface, middle_of, seen_from, surface_of_scan
-from linemap_jax.core.estimation.tracking import begin_track, track
+from linemap_jax.core.estimation.tracking import TrackingSettings, _cov_guess, begin_track, track
 from linemap_jax.core.state import LineMap, Scan, empty_lines
 
 BEARINGS = np.deg2rad(np.arange(180) - 89.5)
@@ -374,6 +375,14 @@ def test_what_tracking_knows_of_a_step_is_seen_from_the_keyframe() -> None:
     information = np.asarray(second.information)[:2, :2]
     assert along @ information @ along < 1e-2 * (across @ information @ across)
     assert abs(along @ information @ across) < 0.1 * (across @ information @ across)
+
+
+def test_what_odometry_leaves_open_turns_with_the_robot() -> None:
+    """After a straight metre: most along the way, where only the distance errs, and nothing in common with across."""
+    noise = OdometryNoise(sigma_distance_distance=0.2)
+    cov = _cov_guess(jnp.array([1.0, 0.0, 0.0]), jnp.array([7.0, 8.0, 0.5]), noise, TrackingSettings())
+    along = np.array([np.cos(0.5), np.sin(0.5), 0.0])
+    np.testing.assert_allclose(along @ np.asarray(cov), ((5 * 0.2) ** 2 + 0.1**2) * along, atol=1e-12)
 
 
 def test_wheels_that_count_backwards_are_found_out_and_others_believed() -> None:

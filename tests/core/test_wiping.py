@@ -143,7 +143,8 @@ def test_cases_of_section_6_3_against_shapely(segment: Any, counts: tuple[int, i
         expected = np.array(part.coords)
         np.testing.assert_allclose([begin, end], expected, atol=1e-9)
     for i in np.flatnonzero(lines.valid) if sum(counts) else []:
-        np.testing.assert_allclose(lines.extent[i].sum(), 0, atol=1e-9)  # anchored at its own middle
+        # Anchored at its own middle
+        np.testing.assert_allclose([lines.extent[i].sum(), lines.offset[i]], 0, atol=1e-9)
 
 
 def test_random_lines_and_triangles_against_shapely() -> None:
