@@ -10,7 +10,7 @@ import pytest
 from scipy import optimize
 
 from linemap_jax import Capacity, Extraction, Rules, Thresholds, empty_map, extract, update
-from linemap_jax.core.circles import FEW, jac_arc_points, near_lines
+from linemap_jax.core.circles import FEW, _linearise, jac_arc_points, near_lines
 from linemap_jax.core.runs import Runs
 from linemap_jax.core.settings import Jacobians, SensorNoise
 from linemap_jax.core.state import Circles, Pose, Scan, empty_circles, empty_lines
@@ -135,6 +135,29 @@ def test_a_fit_is_the_most_likely_pole(seed: int) -> None:
     error = np.array([*circle["center"], circle["radius"]]) - best.x
     assert error @ np.linalg.solve(cov, error) < 0.1**2
     np.testing.assert_allclose(circle["cov"], cov, atol=0.05 * cov.max())
+
+
+def test_the_mean_of_what_a_noisy_beam_says_of_a_pole() -> None:
+    """Of the distance of its point from the circle, by quadrature: a beam that sways meets a pole farther on its side.
+
+    Away from the rim, where second order is enough.
+    """
+    center, radius, noise = np.array([2.0, 0.0]), 0.2, SensorNoise(range_sigma=0.01, bearing_sigma=0.01)
+    bearings = np.arcsin(np.array([-0.5, -0.25, 0.0, 0.3, 0.55]) * radius / center[0])
+    beams = np.stack([np.cos(bearings), np.sin(bearings)], -1)
+
+    def met(bearings: np.ndarray) -> np.ndarray:
+        return center[0] * np.cos(bearings) - np.sqrt(radius**2 - (center[0] * np.sin(bearings)) ** 2)
+
+    nodes, weights = np.polynomial.hermite_e.hermegauss(9)
+    sway, of_range = np.meshgrid(0.01 * nodes, 0.01 * nodes, indexing="ij")
+    ranges = met(bearings[:, None, None] + sway) + of_range
+    off = np.linalg.norm(ranges[..., None] * beams[:, None, None] - center, axis=-1) - radius
+    mean = np.einsum("nij,i,j->n", off, weights, weights) / weights.sum() ** 2
+    at = np.broadcast_to([*center, radius], (5, 3))
+    exact = met(bearings)[:, None] * beams
+    found = _linearise(*(jnp.asarray(x) for x in (exact, beams, at, np.zeros((5, 2)))), noise)
+    np.testing.assert_allclose(found.residual, -mean, rtol=0.2)
 
 
 def test_the_papers_circle_lies_before_the_pole() -> None:

@@ -11,6 +11,7 @@ import pytest
 
 from linemap_jax.core.frames import reanchor
 from linemap_jax.core.lines import (
+    choose_points,
     jac_line_points,
     line_from_regression,
     measure_lines,
@@ -19,7 +20,7 @@ from linemap_jax.core.lines import (
 )
 from linemap_jax.core.runs import Runs
 from linemap_jax.core.sensor import points_from_scan
-from linemap_jax.core.settings import Mount, SensorNoise
+from linemap_jax.core.settings import Mount, Rules, SensorNoise, Thresholds
 from linemap_jax.core.state import Lines, Pose, Scan, empty_lines
 
 BEFORE, AFTER, SIZE = 3, 2, 310
@@ -308,3 +309,18 @@ def test_reanchor_leaves_the_line_where_it_is(lines: Lines) -> None:
     back = reanchor(moved, lines.anchor)
     np.testing.assert_allclose(back.cov_independent, lines.cov_independent, rtol=1e-8, atol=1e-12)
     np.testing.assert_allclose(back.sqrt_persistent, lines.sqrt_persistent, rtol=1e-8, atol=1e-12)
+
+
+def test_points_that_noise_may_have_brought_from_the_wall_beside_are_left_out() -> None:
+    """At a right-angled corner 3 m ahead: those within 3 sigma of the line of the other wall, on both sides."""
+    bearings = np.radians(np.arange(-20.0, 21.0))
+    scan = Scan.from_ranges(3 / (np.cos(bearings) + np.abs(np.sin(bearings))), bearings)
+    here = Pose(mean=jnp.zeros(3), cov=jnp.zeros((3, 3)))
+    points = points_from_scan(scan, here, Mount(), jacobians="analytic")
+    noise, rules = SensorNoise(range_sigma=0.05, bearing_sigma=0.0), Rules(leave_out_sparse=False)
+    kept = choose_points(points, runs_at(41, (0, 20), (21, 40)), Thresholds(), noise, rules)
+    x, y = np.asarray(points.position).T
+    beside = np.abs(3 - x + np.where(np.arange(41) <= 20, -y, y)) / np.sqrt(2)
+    unsure = beside < 3 * 0.05 * np.cos(np.pi / 4 + np.abs(bearings))
+    assert np.flatnonzero(unsure).tolist() == [19, 20, 21]
+    np.testing.assert_array_equal(np.asarray(kept.of_point) < 0, unsure)

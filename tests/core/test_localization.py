@@ -8,10 +8,24 @@ import jax.numpy as jnp
 import numpy as np
 from maps import lines_between, poles_at
 
-from linemap_jax.core.estimation.likelihood_field import distances, field_of_map, search
-from linemap_jax.core.estimation.localization import Belief, Sightings, jac_line_pose, place, predict, update
+from linemap_jax.core.estimation.likelihood_field import distances, field_of_map, field_size, search, thinned
+from linemap_jax.core.estimation.localization import (
+    Belief,
+    LocalizationSettings,
+    Seen,
+    Sightings,
+    innovation_cov,
+    jac_line_pose,
+    place,
+    predict,
+    sight_circles,
+    sight_lines,
+    sight_points,
+    update,
+)
 from linemap_jax.core.estimation.odometry import OdometryNoise, cov_step
 from linemap_jax.core.frames import jac_compose_pose, jac_compose_step
+from linemap_jax.core.settings import Rules, SensorNoise, Thresholds
 from linemap_jax.core.state import LineMap
 
 SLOTS, COUNT = 5, 4
@@ -42,10 +56,13 @@ def sightings(random: np.random.Generator, slots: list[int]) -> Sightings:
     )
 
 
-def joint_filter(before: Belief, seen: Sightings, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+def joint_filter(
+    before: Belief, seen: Sightings, at: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float, np.ndarray]:
     """Schmidt's filter by its definition: pose and all errors of the map in one state, the gain of the map struck out.
 
-    Gives the mean, the covariance of the pose, its covariance with the errors of the map, and the NIS.
+    Gives the mean, the covariance of the pose, its covariance with the errors of the map, the NIS, and the covariance
+    of each innovation by itself.
     """
     b = np.asarray(before.by_map).reshape(3, -1)
     m = b.shape[1]
@@ -65,7 +82,8 @@ def joint_filter(before: Belief, seen: Sightings, at: np.ndarray) -> tuple[np.nd
     gain[3:] = 0
     left = np.eye(3 + m) - gain @ h
     after = left @ cov @ left.T + gain @ noise @ gain.T
-    return np.asarray(before.mean) - (gain @ y)[:3], after[:3, :3], after[:3, 3:], float(y @ np.linalg.solve(s, y))
+    nis, of_each = float(y @ np.linalg.solve(s, y)), s.reshape(n, 2, n, 2)[range(n), :, range(n)]
+    return np.asarray(before.mean) - (gain @ y)[:3], after[:3, :3], after[:3, 3:], nis, of_each
 
 
 def test_an_update_is_that_of_a_joint_filter_that_leaves_the_map_alone() -> None:
@@ -74,7 +92,8 @@ def test_an_update_is_that_of_a_joint_filter_that_leaves_the_map_alone() -> None
     now = belief(random)
     for slots in ([0, 2, 2, 4], [2, 0, 1, 1]):
         seen, at = sightings(random, slots), np.asarray(now.mean) + [0.03, -0.02, 0.01]
-        mean, cov, with_map, nis = joint_filter(now, seen, at)
+        mean, cov, with_map, nis, of_each = joint_filter(now, seen, at)
+        np.testing.assert_allclose(innovation_cov(now, seen), of_each, atol=1e-14)
         now, found_nis = UPDATE(now, jnp.asarray(at), seen)
         np.testing.assert_allclose(now.mean, mean, atol=1e-12)
         np.testing.assert_allclose(now.cov, cov, atol=1e-14)
@@ -139,8 +158,8 @@ ROOM = LineMap(
 
 def test_the_field_holds_distances_and_the_search_finds_the_pose() -> None:
     field = jax.jit(field_of_map, static_argnums=1)(ROOM, 256)
-    points = jnp.array([[3.0, 1.5], [5.9, 2.0], [2.0, 1.3], [-0.5, 2.0], [90.0, 2.0]])
-    np.testing.assert_allclose(distances(field, points), [0.98, 0.1, 0.2, 0.5, 1.0], atol=float(field.cell))
+    points = jnp.array([[3.0, 1.5], [5.9, 2.0], [2.0, 1.3], [-0.5, 2.0], [90.0, 2.0], [2.0, 1.0]])
+    np.testing.assert_allclose(distances(field, points), [0.98, 0.1, 0.2, 0.5, 1.0, 0.1], atol=float(field.cell))
 
     truth = np.array([2.5, 2.2, 0.4])
     angle = np.linspace(-np.pi, np.pi, 64, endpoint=False) + 0.01
@@ -158,3 +177,80 @@ def test_the_field_holds_distances_and_the_search_finds_the_pose() -> None:
     # Where nothing was seen, nothing is known better.
     nothing = find(field, seen, jnp.zeros(64, bool), start, root, counts=counts)
     np.testing.assert_allclose(nothing, start, atol=1e-9)
+
+
+def seen_in_room(truth: np.ndarray) -> Seen:
+    """Of the room from a pose, without noise: its first two walls, its pole, and points of the lower wall."""
+    x, y, theta = truth
+    turn = np.array([[np.cos(theta), np.sin(theta)], [-np.sin(theta), np.cos(theta)]])
+    walls = np.array([[[1, 0], [4, 0]], [[6, 3.5], [6, 1]]])  # the second one begins where the map's ends
+    points = (np.stack([np.linspace(4.2, 5.8, 9), np.zeros(9)], -1) - truth[:2]) @ turn.T
+    ranges = np.hypot(*points.T)
+    return Seen(
+        lines=lines_between((walls - truth[:2]) @ turn.T, room=3),
+        circles=poles_at([[*(np.array([2.0, 1.0]) - truth[:2]) @ turn.T, 0.1]], room=2),
+        collinear=jnp.eye(3, dtype=bool),
+        points=jnp.asarray(points),
+        beams=jnp.asarray(points / ranges[:, None]),
+        ranges=jnp.asarray(ranges),
+        returned=jnp.ones(9, bool),
+        alone=jnp.ones(9, bool),
+        laser=jnp.zeros(2),
+    )
+
+
+def test_sightings_are_what_pose_and_map_err_by() -> None:
+    """y = H error + A e: of a pose that is off, and of a map whose primitives are, each by known amounts.
+
+    Lines, a circle, and points in no line; the covariances of the map are correlated, and a wall is seen far from its
+    anchor, so that an error of its direction moves what is seen of its offset.
+    """
+    truth = np.array([3.0, 2.2, 0.4])
+    seen, root = seen_in_room(truth), jnp.array([[0.02, 0.0], [0.005, 0.006]])
+    cov, noise, settings = jnp.diag(jnp.array([0.02, 0.02, 0.01]) ** 2), SensorNoise(), LocalizationSettings()
+
+    @jax.jit
+    def sight(pose: Any, errors: Any) -> Any:
+        """What is seen of a map whose primitives err by so many sigmas."""
+        moved = errors @ root.T
+        lines = dataclasses.replace(
+            ROOM.lines,
+            offset=ROOM.lines.offset + moved[0],
+            angle=ROOM.lines.angle + moved[1],
+            cov_independent=jnp.broadcast_to(root @ root.T, ROOM.lines.cov_independent.shape),
+        )
+        # A circle's errors are those of its centre.
+        of_center = jnp.zeros((3, 3)).at[:2, :2].set(root @ root.T)
+        poles = dataclasses.replace(
+            ROOM.circles,
+            center=ROOM.circles.center + moved[None],
+            cov_independent=jnp.broadcast_to(of_center, ROOM.circles.cov_independent.shape),
+        )
+        return (
+            sight_lines(seen, pose, cov, lines, Thresholds(), Rules(), settings),
+            sight_circles(seen, pose, cov, poles, 8, settings),
+            sight_points(seen, pose, seen.alone, lines, noise, settings),
+        )
+
+    for off, e in (([0.0, 0.0, 0.0], [0.3, -0.4]), ([0.004, -0.006, 0.003], [0.0, 0.0])):
+        off, e = np.array(off), np.array(e)
+        found = sight(jnp.asarray(truth + off), jnp.asarray(e))
+        for sightings, slots in zip(found, ([0, 1], [8], [0]), strict=True):
+            used = np.asarray(sightings.valid)
+            assert np.asarray(sightings.slot)[used].tolist() == slots
+            expected = np.asarray(sightings.jac_pose)[used] @ off + np.asarray(sightings.by_map)[used] @ e
+            np.testing.assert_allclose(np.asarray(sightings.innovation)[used], expected, atol=1e-4)
+
+
+def test_the_field_of_a_map_has_cells_of_at_most_ten_centimetres() -> None:
+    """A power of two: for a room of 6 m with a metre around it 80 at least; for a town as many as there may be."""
+    assert field_size(ROOM) == 128
+    assert field_size(LineMap(lines=lines_between([[[0, 0], [900, 0]]]), circles=poles_at([]))) == 1024
+    assert field_size(LineMap(lines=lines_between([]), circles=poles_at([]))) == 64
+
+
+def test_beams_are_thinned_evenly() -> None:
+    points = jnp.arange(254.0).reshape(127, 2)
+    few, valid = thinned(points, jnp.arange(127) < 64)
+    np.testing.assert_array_equal(few, points[::2])
+    assert int(valid.sum()) == 32

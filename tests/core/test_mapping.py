@@ -96,3 +96,16 @@ def test_lines_of_the_map_are_merged_unless_a_scan_saw_them_apart() -> None:
     above = dataclasses.replace(scans, valid=scans.valid & (scans.bearings > 0.3))
     _, reports = maps_of(overlapping(), above, poses, "unknown")
     assert reports.merged.tolist() == [1] + [0] * 29
+
+
+def test_an_error_that_persists_goes_over_into_what_is_independent() -> None:
+    """By u[k+1] = a u[k] + sqrt(1 - a^2) w, of a line that no scan sees; a is 0.99 unless given."""
+    behind = overlapping()
+    lines = dataclasses.replace(behind.lines, valid=behind.lines.valid.at[1].set(False))
+    lines = dataclasses.replace(lines, anchor=lines.anchor.at[0].set(jnp.array([20.0, 1.0])))
+    maps, _ = maps_of(dataclasses.replace(behind, lines=lines), *drive(np.zeros((30, 3))), "persistent")
+    scans = np.arange(1, 31)[:, None, None]
+    np.testing.assert_allclose(
+        maps.lines.sqrt_persistent[:, 0], 0.99**scans * np.asarray(lines.sqrt_persistent[0]), rtol=1e-9
+    )
+    np.testing.assert_allclose(maps.lines.cov[:, 0], np.tile(lines.cov[0], (30, 1, 1)), rtol=1e-9)

@@ -41,6 +41,9 @@ def test_compose_and_between_are_products_of_rigid_motions() -> None:
     back = jax.vmap(between)(jnp.asarray(before), jnp.asarray(after))
     np.testing.assert_allclose(back, step, atol=1e-13)
     assert np.all(np.abs(after[:, 2]) <= np.pi)
+    # On the host they are the same.
+    np.testing.assert_allclose(frames_on_host.compose(before, step), after, atol=1e-13)
+    np.testing.assert_allclose(frames_on_host.between(before, after), step, atol=1e-13)
 
 
 def test_hand_derived_jacobians_of_steps() -> None:

@@ -1,14 +1,29 @@
 """The best polyline against all there are, and what `extract` makes of it."""
 
+import dataclasses
 import itertools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.optimize
+import scipy.stats
 
-from linemap_jax import Capacity, Extraction, Pose, Scan, SensorNoise, extract
-from linemap_jax.core.segmentation.polyline import BEGIN, CORNER, END, INSIDE, LEFT, Sweep, best_polyline
+from linemap_jax import Capacity, Extraction, Mount, Pose, Scan, SensorNoise, Thresholds, extract
+from linemap_jax.core.segmentation.optimal import priced
+from linemap_jax.core.segmentation.polyline import (
+    BEGIN,
+    CORNER,
+    END,
+    INSIDE,
+    LEFT,
+    Polyline,
+    Sweep,
+    best_polyline,
+    refine,
+)
+from linemap_jax.core.sensor import points_from_scan
 
 N = 9
 SPACING = np.radians(6.0)
@@ -197,6 +212,65 @@ def test_float32_finds_the_same_far_away():
     assert found[jnp.float32][1] == pytest.approx(found[jnp.float64][1], rel=1e-2)
 
 
+def test_vertices_move_to_where_the_squares_are_least():
+    """Two walls and their corner, from a start that is off, against scipy with lines through points of the plane."""
+    random = np.random.default_rng(6)
+    spacing, count = np.radians(2.0), 50
+    angle = spacing * np.arange(count)
+    vertices = np.array([[3.0, 0.0], [2.5, 2.2], [-0.6, 1.9]])  # seen at 41.3 degrees, between two beams
+    beams = np.stack([np.cos(angle), np.sin(angle)], -1)
+
+    def ranges_to(polar: np.ndarray) -> np.ndarray:
+        """By angles and inverse ranges of the vertices."""
+        at = np.stack([np.cos(polar[:3]), np.sin(polar[:3])], -1) / polar[3:, None]
+        first, second = (np.where((angle <= polar[1])[:, None], at[i], at[i + 1]) for i in (0, 1))
+        normal = np.stack([second[:, 1] - first[:, 1], first[:, 0] - second[:, 0]], -1)
+        return np.sum(normal * first, 1) / np.sum(normal * beams, 1)
+
+    def free(x: np.ndarray) -> np.ndarray:
+        """The ends stay on their beams."""
+        return np.concatenate([[0, x[0], angle[-1]], x[1:]])
+
+    polar = np.concatenate([np.arctan2(vertices[:, 1], vertices[:, 0]), 1 / np.hypot(*vertices.T)])
+    ranges = ranges_to(polar) + random.normal(0, 0.02, count)
+    start = np.array([angle[18], 1 / ranges[0], 1 / ranges[18], 1 / ranges[-1]])
+    best = scipy.optimize.least_squares(lambda x: ranges_to(free(x)) - ranges, start)
+    line = Polyline(
+        angle=jnp.asarray([*free(start)[:3], 1e3]),
+        inverse=jnp.asarray([*start[1:], 1.0]),
+        valid=jnp.asarray([True, True, True, False]),
+        is_begin=jnp.arange(4) == 0,
+        is_end=jnp.arange(4) == 2,
+    )
+    everywhere, no = jnp.ones(count, bool), jnp.zeros((), bool)
+    found, cost = jax.jit(refine)(line, jnp.asarray(angle), jnp.asarray(ranges), everywhere, jnp.asarray(spacing), no)
+    assert cost == pytest.approx(2 * best.cost, rel=1e-4)
+    # In sigmas of the estimate
+    off = best.jac @ (np.array([found.angle[1], *found.inverse[:3]]) - best.x) / 0.02
+    assert np.linalg.norm(off) < 0.01
+
+
+def test_what_a_search_reckons_with():
+    """The price of a vertex; and how ranges err.
+
+    dr / d(bearing) = r tan(incidence): at both ends of a wall too, and beside a corner by the steeper wall.
+    """
+    angle = np.radians(0.5 * np.arange(40, 121))
+    wall = Scan.from_ranges(3 / np.cos(angle), angle)
+    points = points_from_scan(wall, HERE, Mount(), jacobians="analytic")
+    noise = SensorNoise(range_sigma=0.01, bearing_sigma=0.005)
+    follows = jnp.arange(len(angle)) > 0
+    sweep, price = priced(points, follows, Thresholds(), noise)
+    # What noise gains by two more numbers at one of the points is chi-square: more than the price in a tenth of scans.
+    assert len(angle) * float(scipy.stats.chi2.sf(price, 2)) == pytest.approx(0.1)
+    expected = np.hypot(0.01, 0.005 * 3 / np.cos(angle) * np.tan(angle))
+    np.testing.assert_allclose(1 / sweep.weight, expected, rtol=0.08)
+    # Where a surface ends, what stands behind it says nothing of its slant.
+    broken = dataclasses.replace(points, range=points.range.at[40:].add(2.0))
+    parted, _ = priced(broken, follows & (jnp.arange(len(angle)) != 40), Thresholds(), noise)
+    np.testing.assert_allclose(parted.weight[:40], sweep.weight[:40], rtol=0.08)
+
+
 # --- Extractions
 
 
@@ -295,6 +369,12 @@ def test_the_lines_are_as_good_as_their_covariances_say(by_criterion):
     nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(cov), error)
     # Chi-square with two degrees of freedom has a standard deviation of 2.
     assert abs(nees.mean() - 2) < 5 * 2 / np.sqrt(RUNS)
+
+
+def test_noise_makes_few_corners(by_criterion):
+    """In less than a tenth of the scans, as the price of a vertex has it."""
+    count = np.asarray(by_criterion.lines.valid)[-RUNS:].sum(1)
+    assert np.mean(count > 4) < 0.1
 
 
 @pytest.mark.parametrize("budget", [1, 0, -3, True])

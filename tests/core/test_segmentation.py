@@ -55,6 +55,13 @@ def test_one_wall_is_one_line() -> None:
     assert counts(found) == {}
 
 
+def test_an_end_is_unsure_by_where_the_next_beam_would_have_met_the_wall() -> None:
+    """The wall may end anywhere between: the variance is that of a uniform distribution."""
+    found = extracted(WALL, noise=SensorNoise(range_sigma=1e-6, bearing_sigma=1e-6))
+    beyond = 2 * (np.tan(BEARINGS[-1] + SPACING) - np.tan(BEARINGS[-1]))
+    np.testing.assert_allclose(found.lines.var_extent[0], beyond**2 / 12, rtol=0.03)
+
+
 def test_criterion_1_breaks_at_a_step() -> None:
     ranges = np.where(np.arange(N) < 20, WALL, 1.5 * WALL)
     found = extracted(ranges)
@@ -146,6 +153,18 @@ def test_criterion_2_widens_with_the_noise(sigmas: float) -> None:
     ranges[20] += 0.06
     found = extracted(ranges, Thresholds(line_sigmas=sigmas))
     assert (counts(found).get("distance", 0) > 0) == (sigmas == 0)
+
+
+@pytest.mark.parametrize("n", [3, 12])
+def test_criterion_2_widens_by_what_the_line_of_few_points_is_uncertain_by(n: int) -> None:
+    """5 sigma sqrt(1 + 1/n + leverage): of three points the line is not known well even where the next one lies."""
+    y = 2 * np.tan(BEARINGS[20 - n : 20])
+    gate = 5 * 0.02 * np.sqrt(1 + 1 / n + y.mean() ** 2 / np.sum((y - y.mean()) ** 2))
+    for share, broken in ((0.98, 0), (1.02, 1)):
+        ranges = np.where((np.arange(N) >= 20 - n) & (np.arange(N) < 20), WALL, np.nan)
+        ranges[20] = 2 + share * gate
+        found = extracted(ranges, Thresholds(gap_distance=0.5))
+        assert counts(found).get("distance", 0) == broken
 
 
 @pytest.mark.parametrize(("missing", "broken"), [(1, 0), (2, 1)])

@@ -7,13 +7,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from maps import lines_between, poles_at
 
-from linemap_jax.core.estimation.adjustment import LineSightings, adjust, residual_of_sighting
+from linemap_jax.core.estimation.adjustment import (
+    LineSightings,
+    adjust,
+    residual_of_sighting,
+    with_error_of_poses,
+)
 from linemap_jax.core.estimation.loops import LoopSettings, close_loop
+from linemap_jax.core.estimation.odometry import OdometryNoise
 from linemap_jax.core.estimation.pose_graph import Closures, PoseGraph, cov_of_registration, optimise
 from linemap_jax.core.estimation.registration import nearest, register
-from linemap_jax.core.estimation.surface import Surface, seen_from, surface_of_scan
-from linemap_jax.core.state import Lines, Scan, empty_lines
+from linemap_jax.core.estimation.surface import Surface, middle_of, seen_from, surface_of_scan
+from linemap_jax.core.estimation.tracking import TrackingSettings, _cov_guess, begin_track, track
+from linemap_jax.core.state import LineMap, Lines, Scan, empty_lines
 
 adjusted, optimised = jax.jit(adjust), jax.jit(optimise)
 
@@ -46,6 +54,7 @@ def surface_in(corners: np.ndarray, pose: Any, noise: np.random.Generator | None
 SURFACE = jax.jit(surface_of_scan)
 REGISTER = jax.jit(register)
 CLOSE = jax.jit(close_loop)
+TRACK = jax.jit(track)
 
 
 def test_the_surface_of_a_room() -> None:
@@ -331,3 +340,99 @@ def test_seen_from_a_pose() -> None:
     moved = seen_from(surface, jnp.asarray([2.0, 3.0, np.pi / 2]))
     np.testing.assert_allclose(moved.position, [[2.0, 4.0]], atol=1e-15)
     np.testing.assert_allclose(moved.normal, [[0.0, -1.0]], atol=1e-15)
+
+
+def test_what_no_keyframe_has_seen_is_as_uncertain_as_the_nearest_one() -> None:
+    """It moves rigidly with that keyframe; derivatives are numerical. What was seen, and free slots, stay."""
+    root = np.array([[0.03, 0.0, 0.0], [0.01, 0.02, 0.0], [-0.004, 0.006, 0.01]])
+    poses = np.array([[2.0, 1.0, 0.5], [40.0, 0.0, 0.0]])
+    cov_poses = np.stack([root @ root.T, np.eye(3)])
+    line_map = LineMap(
+        lines=lines_between([[[3.0, 4.0], [5.0, 4.5]], [[3.0, 0.0], [5.0, 0.0]]], room=3),
+        circles=poles_at([[4.0, -2.0, 0.1]], room=2),
+    )
+    seen = jnp.asarray([False, True, False])
+    after = with_error_of_poses(line_map, seen, jnp.asarray(poses), jnp.asarray(cov_poses))
+    lines, circles = line_map.lines, line_map.circles
+    anchor, normal = np.asarray(lines.anchor)[0], np.asarray(lines.normal)[0]
+
+    def moved(error: np.ndarray, point: np.ndarray) -> np.ndarray:
+        """A point that was measured from the nearest keyframe, if that stands elsewhere."""
+        return compose(poses[0] + error, between(poses[0], [*point, 0.0]))[:2]
+
+    def line(error: np.ndarray) -> np.ndarray:
+        place, ahead = moved(error, anchor), moved(error, anchor + normal)
+        turned = ahead - place
+        return np.array([turned @ (place - anchor), np.arctan2(*turned[::-1])])
+
+    def circle(error: np.ndarray) -> np.ndarray:
+        return np.append(moved(error, np.asarray(circles.center)[0]), 0.1)
+
+    for function, before, cov in (
+        (line, lines.cov_independent, after.lines.cov_independent),
+        (circle, circles.cov_independent, after.circles.cov_independent),
+    ):
+        jac = np.stack([(function(h) - function(-h)) / 2e-6 for h in 1e-6 * np.eye(3)], -1)
+        np.testing.assert_allclose(cov[0] - before[0], jac @ cov_poses[0] @ jac.T, atol=1e-10)
+        np.testing.assert_array_equal(cov[1:], before[1:])
+
+
+def tracked(corners: list[np.ndarray], poses: np.ndarray, odometry: np.ndarray) -> list[Any]:
+    """What tracking says of scans from some poses, each among walls of its own."""
+    scans = [
+        Scan.from_ranges(
+            jnp.asarray(ranges_in(walls, pose), "float32"), jnp.asarray(BEARINGS, "float32"), range_max=30.0
+        )
+        for walls, pose in zip(corners, poses, strict=True)
+    ]
+    told = jnp.asarray(odometry, "float32")
+    state, said = begin_track(told[0], scans[0]), []
+    for scan, pose in zip(scans, told, strict=True):
+        state, one = TRACK(state, scan, pose)
+        said.append(one)
+    return said
+
+
+def test_what_tracking_knows_of_a_step_is_seen_from_the_keyframe() -> None:
+    """Along a corridor nothing is known, which from a robot that looks aslant is ahead and to the right."""
+    start = np.array([0.0, 0.0, 0.5])
+    poses = np.stack([start, compose(start, [0.3, 0.0, 0.0])])
+    first, second = tracked([CORRIDOR] * 2, poses, poses)
+    assert first.is_keyframe
+    assert not second.is_keyframe
+    np.testing.assert_allclose(second.step, [0.3, 0.0, 0.0], atol=0.03)
+    along, across = np.array([[np.cos(0.5), -np.sin(0.5)], [np.sin(0.5), np.cos(0.5)]])
+    information = np.asarray(second.information)[:2, :2]
+    assert along @ information @ along < 1e-2 * (across @ information @ across)
+    assert abs(along @ information @ across) < 0.1 * (across @ information @ across)
+
+
+def test_what_odometry_leaves_open_turns_with_the_robot() -> None:
+    """After a straight metre: most along the way, where only the distance errs, and nothing in common with across."""
+    noise = OdometryNoise(sigma_distance_distance=0.2)
+    cov = _cov_guess(jnp.array([1.0, 0.0, 0.0]), jnp.array([7.0, 8.0, 0.5]), noise, TrackingSettings())
+    along = np.array([np.cos(0.5), np.sin(0.5), 0.0])
+    np.testing.assert_allclose(along @ np.asarray(cov), ((5 * 0.2) ** 2 + 0.1**2) * along, atol=1e-12)
+
+
+def test_wheels_that_count_backwards_are_found_out_and_others_believed() -> None:
+    """In a room a step back counted as one ahead is told by the scan; where another says no more, odometry stands."""
+    backwards = np.array([[0.0, 0.0, 0.2], [-0.392, -0.0795, 0.2]])
+    counted = np.array([[0.0, 0.0, 0.2], [0.392, 0.0795, 0.2]])
+    _, said = tracked([ROOM] * 2, backwards, counted)
+    np.testing.assert_allclose(said.pose, backwards[1], atol=0.01)
+    # A cabinet in a corridor, new in the second scan: few points agree, however far the robot has gone along it.
+    cabinet = np.array([[-40.0, -1.0], [40.0, -1.0], [40.0, 1.0], [2.5, 1.0], [2.5, -0.5], [0.6, -0.5], [0.6, 1.0]])
+    cabinet = np.concatenate([cabinet, [[-40.0, 1.0]]])
+    ahead = np.array([[0.0, 0.0, 0.0], [0.4, 0.0, 0.0]])
+    _, said = tracked([CORRIDOR, cabinet], ahead, ahead)
+    assert said.share < 0.8
+    np.testing.assert_allclose(said.pose, ahead[1], atol=0.1)
+
+
+def test_what_a_scan_looks_at_is_the_middle_of_what_is_near() -> None:
+    position = jnp.array([[1.0, 0.0], [3.0, 2.0], [0.0, 11.0], [5.0, 5.0]])
+    valid = jnp.array([True, True, True, False])
+    surface = Surface(position=position, normal=position, flat=valid, valid=valid)
+    np.testing.assert_allclose(middle_of(surface), [2.0, 1.0])
+    np.testing.assert_allclose(middle_of(surface, reach=0.5), [0.0, 0.0])

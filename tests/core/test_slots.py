@@ -1,12 +1,58 @@
-"""Slots: what is computed in a loop of two steps is what would be computed at once."""
+"""Slots: finding them, against NumPy; what is computed in a loop of two steps is what would be computed at once."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from linemap_jax.core.slots import computed_once, directed
+from linemap_jax.core.slots import (
+    all_true,
+    computed_once,
+    directed,
+    earliest_true,
+    first_true,
+    free_slots,
+    latest_true,
+    least,
+    rank_of_true,
+    resize,
+)
 from linemap_jax.core.state import empty_lines
+
+
+@pytest.mark.parametrize("pattern", ["......", "######", ".#..#.", "#....#"])
+def test_the_true_ones_are_found(pattern: str) -> None:
+    which = np.array([c == "#" for c in pattern])
+    n, there = len(which), np.flatnonzero(which)
+    asked = jnp.asarray(which)
+    assert first_true(asked) == (there[0] if len(there) else n)
+    for size in (2, 6):
+        assert all_true(asked, size).tolist() == [*there, *[n] * n][:size]
+    assert rank_of_true(asked).tolist() == [int(np.sum(there < i)) for i in range(n)]
+    assert latest_true(asked).tolist() == [max([-1, *there[there <= i]]) for i in range(n)]
+    assert earliest_true(asked).tolist() == [min([n, *there[there >= i]]) for i in range(n)]
+
+
+def test_free_slots_go_to_those_that_want_one_in_order() -> None:
+    wanted = jnp.array([True, False, True, True])
+    for taken, slots, lacking in (("#.#..", [1, -1, 3, 4], False), ("#.##.", [1, -1, 4, -1], True)):
+        found, lacks = free_slots(wanted, jnp.array([c == "#" for c in taken]))
+        assert found.tolist() == slots
+        assert bool(lacks) == lacking
+
+
+def test_the_least_of_each_row_is_the_first_of_equal_ones() -> None:
+    where, value = least(jnp.array([[3.0, 1.0, 1.0], [jnp.inf, jnp.inf, jnp.inf], [2.0, 5.0, 0.5]]))
+    assert where.tolist() == [1, 0, 2]
+    assert value.tolist() == [1.0, jnp.inf, 0.5]
+
+
+def test_slots_may_be_added_but_not_taken() -> None:
+    lines = empty_lines(3)
+    assert resize(lines, 3).valid.shape == (3,)
+    assert resize(lines, 5).sqrt_persistent.shape == (5, 2, 3)
+    with pytest.raises(ValueError, match="cannot shrink 3 slots to 2"):
+        resize(lines, 2)
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 8])

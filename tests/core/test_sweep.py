@@ -102,3 +102,16 @@ def test_beams_keep_their_numbers():
     of_beam = np.asarray(found_in(*room(-np.pi, extra=1)).line_of_beam)
     assert of_beam[0] == of_beam[5] == of_beam[-5] >= 0
     assert of_beam[-1] == -1
+
+
+def test_many_sweeps_at_once_are_as_one_by_one():
+    ranges, bearings = room(2.0)
+    for some in ([bearings], [bearings, bearings / 2], [bearings / 2, bearings / 3]):
+        b = np.stack(some)
+        r, spacing = np.broadcast_to(ranges, b.shape), np.median(np.abs(np.diff(b)), -1)
+        valid = np.isfinite(r)
+        together = close_sweep(np.where(valid, r, 0), b, valid, spacing)
+        for i in range(len(some)):
+            alone = close_sweep(np.where(valid[i], r[i], 0), b[i], valid[i], spacing[i])
+            np.testing.assert_array_equal(together[0][i], alone[0])
+            assert together[1][i] == alone[1]

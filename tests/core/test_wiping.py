@@ -22,6 +22,7 @@ from linemap_jax.core.wiping import (
     Triangles,
     circles_inside_triangles,
     inside_triangles,
+    may_have_passed,
     passed_circles,
     passed_through,
     remaining,
@@ -67,6 +68,10 @@ def test_remaining_is_interval_subtraction(extent: tuple[float, int], holes: lis
     assert np.all(ends >= begins)
 
 
+BESIDE = 0.07
+"""m. So far beside their lines stand the anchors of `lines_of`: what holds for one at the line is not enough."""
+
+
 def lines_of(*segments: Any, capacity: int = 6) -> Lines:
     """Lines between pairs of points."""
     lines = empty_lines(capacity)
@@ -74,9 +79,11 @@ def lines_of(*segments: Any, capacity: int = 6) -> Lines:
         begin, end = np.asarray(begin, float), np.asarray(end, float)
         tangent = (end - begin) / np.linalg.norm(end - begin)
         half = np.linalg.norm(end - begin) / 2
+        normal = np.array([tangent[1], -tangent[0]])
         lines = dataclasses.replace(
             lines,
-            anchor=lines.anchor.at[i].set((begin + end) / 2),
+            anchor=lines.anchor.at[i].set((begin + end) / 2 - BESIDE * normal),
+            offset=lines.offset.at[i].set(BESIDE),
             angle=lines.angle.at[i].set(np.arctan2(tangent[1], tangent[0]) - np.pi / 2),
             cov_independent=lines.cov_independent.at[i].set(jnp.diag(jnp.array([1e-5, 1e-5]))),
             extent=lines.extent.at[i].set(jnp.array([-half, half])),
@@ -142,7 +149,8 @@ def test_cases_of_section_6_3_against_shapely(segment: Any, counts: tuple[int, i
         expected = np.array(part.coords)
         np.testing.assert_allclose([begin, end], expected, atol=1e-9)
     for i in np.flatnonzero(lines.valid) if sum(counts) else []:
-        np.testing.assert_allclose(lines.extent[i].sum(), 0, atol=1e-9)  # anchored at its own middle
+        # Anchored at its own middle
+        np.testing.assert_allclose([lines.extent[i].sum(), lines.offset[i]], 0, atol=1e-9)
 
 
 def test_random_lines_and_triangles_against_shapely() -> None:
@@ -297,7 +305,8 @@ def test_beams_never_wipe_the_line_that_they_measure(own: int, gone: bool) -> No
 
 @pytest.mark.parametrize(
     ("x", "radius", "gone"),
-    [(2.0, 0.1, True), (2.95, 0.1, False), (4.0, 0.1, False), (2.0, 0.005, False)],
+    # Beams are 3.5 cm apart at 2 m: a pole of 4 cm cannot stand between two of them, one of 1 cm can.
+    [(2.0, 0.1, True), (2.95, 0.1, False), (4.0, 0.1, False), (2.0, 0.02, True), (2.0, 0.005, False)],
 )
 def test_circles_that_beams_passed(x: float, radius: float, gone: bool) -> None:
     found = lines_of(([3.0, -3.0], [3.0, 3.0]), capacity=1)
@@ -305,3 +314,60 @@ def test_circles_that_beams_passed(x: float, radius: float, gone: bool) -> None:
     swath = swath_of_scan(points, HERE, jnp.zeros(91, jnp.int32), found, jnp.array([0]), jnp.array([1]), Thresholds())
     circles = circle_at(x, 0.2, radius)
     assert bool(passed_circles(circles, swath, HERE.cov, Thresholds(), SensorNoise())[0]) == gone
+
+
+def test_a_beam_passed_if_it_ended_beyond_the_line_by_the_spread_of_that() -> None:
+    """The spread is that of where the point would lie across the line if the beam had ended on it.
+
+    It comes from range, bearing, pose and line; each derivative is numerical. A beam must pass just below that many
+    sigmas and must not just above.
+    """
+    pose, mount, bearing = np.array([0.4, -0.3, 0.2]), np.array([0.3, -0.5, 0.1]), np.array([0.15, 0.2])
+    root = np.array([[0.02, 0.0, 0.0], [-0.012, 0.015, 0.0], [0.009, -0.011, 0.006]])
+    noise, cov_pose = SensorNoise(range_sigma=0.02, bearing_sigma=0.004), root @ root.T
+    line = jax.tree.map(lambda x: x[0], lines_of(([2.5, -3.0], [3.2, 4.0])))
+    line = dataclasses.replace(line, cov_independent=jnp.array([[4e-4, 1e-4], [1e-4, 1e-4]]))
+    turn = float(line.angle)
+
+    def across(x: np.ndarray) -> np.ndarray:
+        """Of the points of both beams; x: pose, range, bearing and line, each with its error."""
+        c, s = np.cos(x[2]), np.sin(x[2])
+        laser = x[:2] + np.array([[c, -s], [s, c]]) @ mount[:2]
+        angle = x[2] + mount[2] + bearing + x[5]
+        points = laser + (reach + x[3])[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
+        return (
+            (points - np.asarray(line.anchor)) @ [np.cos(turn + x[7]), np.sin(turn + x[7])] - float(line.offset) - x[6]
+        )
+
+    at, reach = np.concatenate([pose, np.zeros(5)]), np.zeros(2)
+    here = across(at)
+    reach = np.ones(2)
+    reach = here / (here - across(at))  # where the beams meet the line
+    np.testing.assert_allclose(across(at), 0, atol=1e-12)
+    jac = np.stack([(across(at + h) - across(at - h)) / 2e-6 for h in 1e-6 * np.eye(8)], -1)[:, [0, 1, 2, 3, 5, 6, 7]]
+    cov = np.zeros((7, 7))
+    cov[:3, :3], cov[3, 3], cov[4, 4], cov[5:, 5:] = cov_pose, 0.02**2, 0.004**2, line.cov_independent
+    spread = np.sqrt(np.einsum("ki,ij,kj->k", jac, cov, jac))
+
+    beyond = 0.3
+    scan = Scan.from_ranges(reach + beyond / np.abs(jac[:, 3]), bearing)
+    where = Pose(mean=jnp.asarray(pose), cov=jnp.asarray(cov_pose))
+    points = points_from_scan(scan, where, Mount(*mount), jacobians="analytic")
+    none = jnp.array([-1])
+    swath = swath_of_scan(points, where, jnp.full(2, -1), lines_of(capacity=1), none, none, Thresholds())
+    for sigmas, gone in ((0.999, True), (1.001, False)):
+        # Of the two beams the one with the larger spread decides.
+        gates = Thresholds(wipe_sigmas=sigmas * beyond / spread.max(), match_distance=0.0)
+        assert bool(passed_through(line, jnp.array(0), swath, where.cov, gates, noise)[2][0]) == gone
+
+
+def test_a_line_that_two_beams_passed_is_looked_at() -> None:
+    """What is cheap to tell may not say no where something is gone: two beams are enough, one is not."""
+    points = points_from_scan(Scan.from_ranges(WALL, BEARINGS), HERE, Mount(), jacobians="analytic")
+    none = jnp.array([-1])
+    swath = swath_of_scan(points, HERE, jnp.full(91, -1), lines_of(capacity=1), none, none, Thresholds())
+    for end, two in ((0.045, True), (0.025, False)):  # beams at y = 0 and 0.035
+        line = jax.tree.map(lambda x: x[0], lines_of(([2.0, -0.01], [2.0, end])))
+        gone = passed_through(line, jnp.array(0), swath, HERE.cov, Thresholds(), SensorNoise())[2]
+        assert bool(gone.any()) == two
+        assert bool(may_have_passed(line, jnp.array(0), swath, Thresholds())) == two
