@@ -25,6 +25,10 @@ JACOBIAN_ERROR = 0.005
 that lets an error that persists cancel between two viewpoints would believe in A to the last digit."""
 
 
+RIDGE = 8.0
+"""Digits of rounding, in units of the last place, by which the variances of an innovation are enlarged."""
+
+
 @pytree
 class Errors:
     """The error of an estimate of n numbers, in the two parts of `Lines` and `Circles`."""
@@ -75,7 +79,9 @@ def combine(old: Errors, new: Errors, pose_error: PoseError) -> tuple[Float[Arra
     else:
         before = c_old - product(a_old, jnp.swapaxes(difference, -1, -2))
         innovation = c_old + c_new + squared(difference)
-    unit = inverse(symmetric(innovation))
+    # Where one direction is known very much better than another, rounding would make it indefinite without the ridge.
+    ridge = 1 + RIDGE * jnp.finfo(innovation.dtype).eps * jnp.eye(innovation.shape[-1], dtype=innovation.dtype)
+    unit = inverse(symmetric(innovation) * jnp.broadcast_to(ridge, innovation.shape))
     gain = product(before, unit)
     keep = jnp.broadcast_to(jnp.eye(gain.shape[-1], dtype=gain.dtype), gain.shape) - gain
     independent = propagate(keep, c_old) + propagate(gain, c_new)
@@ -212,8 +218,9 @@ def _fuse_ends(
     scans at 5 cm of pose error). By default end points that agree within their spread are averaged by their variances;
     an observed end well beyond the old one replaces it, and one well short of it (the rest was hidden) does nothing.
     """
-    tangent = model.tangent
-    along = jnp.stack([dot(tangent, end - model.anchor) for end in (pieces.begin, pieces.end)], -1)
+    # From anchor to anchor: coordinates of the world have fewer digits far from its origin.
+    middle = pieces.anchor - model.anchor + pieces.offset[:, None] * pieces.normal
+    along = dot(model.tangent, middle)[:, None] + dot(model.tangent, pieces.tangent)[:, None] * pieces.extent
 
     def outermost(direction: int, old: Array, var_old: Array) -> tuple[Array, Array]:
         """The lower end for direction -1, the upper one for +1, in coordinates in which larger is longer."""

@@ -42,7 +42,7 @@ def test_a_full_disk_leaves_the_table_as_it_was(tmp_path, monkeypatch):
     table = ResultsTable(tmp_path, ABOUT_IT)
     table.append(0, rows(0, 2))
 
-    def full(*_):
+    def full(*_, **__):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(pq, "write_table", full)
