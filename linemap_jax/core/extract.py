@@ -143,13 +143,17 @@ def usable(scan: Scan, pose: Pose) -> tuple[Scan, Pose, Bool[Array, ""]]:
 
     What stands in a masked beam may be anything; a scan with a pose that is not finite loses all its beams. What is
     beyond `LARGEST` counts as infinite, and so does the pose where its covariance is none: variances are not negative,
-    and correlations, up to rounding, not beyond one.
+    and correlations, up to rounding, not beyond one. No heading is less known than to half a turn.
     """
     variance = jnp.diagonal(pose.cov)
     finite = jnp.all(jnp.abs(pose.mean) <= LARGEST) & jnp.all((variance >= 0) & (variance <= LARGEST))
     finite &= jnp.all(pose.cov**2 <= ONE_AND_ROUNDING * variance[:, None] * variance[None])
     valid = scan.valid & finite & (scan.ranges <= LARGEST) & (jnp.abs(scan.bearings) <= LARGEST)
     ranges, bearings = (jnp.where(valid, x, 0) for x in (scan.ranges, scan.bearings))
+    # A sigma of many turns says no more than one of half a turn, and float32 would lose all else beside it.
+    heading = jnp.where(variance[2] > jnp.pi**2, jnp.pi * jax.lax.rsqrt(jnp.maximum(variance[2], 1)), 1)
+    known = jnp.ones_like(variance).at[2].set(heading)
+    pose = dataclasses.replace(pose, cov=pose.cov * known[:, None] * known[None])
     pose = jax.tree.map(lambda x: jnp.where(finite, x, 0), pose)
     return dataclasses.replace(scan, ranges=ranges, bearings=bearings, valid=valid), pose, finite
 
