@@ -105,7 +105,8 @@ class ResultsTable:
             where = f"the table in {self.folder}, {name}"
             try:
                 part = pq.read_table(self.folder / name, page_checksum_verification=True)
-            except (OSError, pa.ArrowException) as error:
+                part.schema.names  # noqa: B018  raises where a name is no text
+            except (OSError, UnicodeDecodeError, pa.ArrowException) as error:
                 raise TableError(f"cannot read {where}: {_told(error)}") from error
             if part.num_rows != count or (parts and part.schema != parts[0].schema):
                 raise TableError(f"cannot read {where}: it holds other rows or columns than it should")

@@ -309,6 +309,22 @@ def test_persistent_is_a_kalman_filter_that_considers_the_pose_error() -> None:
         np.testing.assert_allclose(mine.cov_independent[0] + root @ root.T, p[:2, :2], rtol=1e-7, atol=1e-10)
 
 
+def test_a_large_gain_leaves_a_covariance_in_float32() -> None:
+    """Views that differ in what persists by far more than by noise: the gain is a thousand and more."""
+    random = np.random.default_rng(0)
+    n = 2000
+    parts = {"cov_independent": jnp.asarray(np.tile(1e-12 * np.eye(2), (n, 1, 1))), "times_detected": jnp.ones(n, int)}
+    root = random.normal(size=(n, 2, 3))
+    differing = root + 1e-3 * random.normal(size=(n, 2, 3))
+    old, new = (Errors(sqrt_persistent=jnp.asarray(x), **parts) for x in (root, differing))
+    _, joint = combine(in_float32(old), in_float32(new), "persistent")
+    cov = np.asarray(joint.cov_independent, float)
+    variance = np.diagonal(cov, axis1=-2, axis2=-1)
+    assert (variance > 0).all()
+    sigma = np.sqrt(variance)
+    assert np.linalg.eigvalsh(cov / (sigma[:, :, None] * sigma[:, None])).min() > -1e-5
+
+
 def test_pieces_move_with_the_pose_as_their_line_did_at_first() -> None:
     """Against the motion of a line by a displaced robot, by central differences; from both sides."""
     pose = Pose(mean=jnp.array([1.0, -2.0, 0.3]), cov=jnp.array([[4e-4, 1e-4, 0], [1e-4, 9e-4, 2e-5], [0, 2e-5, 1e-4]]))
