@@ -25,10 +25,6 @@ JACOBIAN_ERROR = 0.005
 that lets an error that persists cancel between two viewpoints would believe in A to the last digit."""
 
 
-RIDGE = 8.0
-"""Digits of rounding, in units of the last place, by which the variances of an innovation are enlarged."""
-
-
 @pytree
 class Errors:
     """The error of an estimate of n numbers, in the two parts of `Lines` and `Circles`."""
@@ -79,9 +75,7 @@ def combine(old: Errors, new: Errors, pose_error: PoseError) -> tuple[Float[Arra
     else:
         before = c_old - product(a_old, jnp.swapaxes(difference, -1, -2))
         innovation = c_old + c_new + squared(difference)
-    # Where one direction is known very much better than another, rounding would make it indefinite without the ridge.
-    ridge = 1 + RIDGE * jnp.finfo(innovation.dtype).eps * jnp.eye(innovation.shape[-1], dtype=innovation.dtype)
-    unit = inverse(symmetric(innovation) * jnp.broadcast_to(ridge, innovation.shape))
+    unit = inverse(symmetric(innovation))
     gain = product(before, unit)
     keep = jnp.broadcast_to(jnp.eye(gain.shape[-1], dtype=gain.dtype), gain.shape) - gain
     # Squares of roots: of K C K^T, multiplied out, a large gain leaves rounding errors larger than C.

@@ -310,19 +310,26 @@ def test_persistent_is_a_kalman_filter_that_considers_the_pose_error() -> None:
 
 
 def test_a_large_gain_leaves_a_covariance_in_float32() -> None:
-    """Views that differ in what persists by far more than by noise: the gain is a thousand and more."""
+    """Views that differ in what persists by far more than by noise, one of them much surer of one direction."""
     random = np.random.default_rng(0)
     n = 2000
-    parts = {"cov_independent": jnp.asarray(np.tile(1e-12 * np.eye(2), (n, 1, 1))), "times_detected": jnp.ones(n, int)}
-    root = random.normal(size=(n, 2, 3))
-    differing = root + 1e-3 * random.normal(size=(n, 2, 3))
-    old, new = (Errors(sqrt_persistent=jnp.asarray(x), **parts) for x in (root, differing))
-    _, joint = combine(in_float32(old), in_float32(new), "persistent")
-    cov = np.asarray(joint.cov_independent, float)
-    variance = np.diagonal(cov, axis1=-2, axis2=-1)
-    assert (variance > 0).all()
-    sigma = np.sqrt(variance)
-    assert np.linalg.eigvalsh(cov / (sigma[:, :, None] * sigma[:, None])).min() > -1e-5
+
+    def errors(lever: np.ndarray, cov: np.ndarray) -> Errors:
+        root = np.zeros((n, 2, 3))
+        root[:, 0, 0], root[:, 1, 0] = lever, 1.0
+        times = jnp.ones(n, int)
+        return in_float32(
+            Errors(cov_independent=jnp.asarray(cov), sqrt_persistent=jnp.asarray(root), times_detected=times)
+        )
+
+    unsure = np.stack([np.cos(angle := random.uniform(0, np.pi, n)), np.sin(angle)], -1)
+    cov = 1e-12 * (unsure[:, :, None] * unsure[:, None] + 1e-5 * np.eye(2))
+    lever = random.normal(size=n)
+    new = errors(lever + 0.1 * random.normal(size=n), np.tile(1e-12 * np.eye(2), (n, 1, 1)))
+    _, joint = combine(errors(lever, cov), new, "persistent")
+    fused = np.asarray(joint.cov_independent, float)
+    sigma = np.sqrt(np.diagonal(fused, axis1=-2, axis2=-1))
+    assert np.linalg.eigvalsh(fused / (sigma[:, :, None] * sigma[:, None])).min() > -1e-5
 
 
 def test_pieces_move_with_the_pose_as_their_line_did_at_first() -> None:
