@@ -243,7 +243,7 @@ class Variant:
         """Poses; the map before and after the scans of a case; and the reports."""
         scans, poses = scans_of(case, self.dtype)
         stacked = [jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *each) for each in (scans, poses)]
-        before = empty_map(MAP_CAPACITY, self.dtype)
+        before = empty_map(MAP_CAPACITY, np.dtype(self.dtype))
         active = jnp.ones(SCANS, bool)
         after, report = self.run(before, *stacked, active, **settings_of(case, self.dtype))
         return poses, before, after, report
