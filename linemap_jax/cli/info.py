@@ -39,7 +39,10 @@ class Info(LogInput):
         topics = told.pop("scan_topics")
         if self.scan_topic is None and len(topics) > 1:
             told["scanners"] = {topic: _of_scanner(_told(self, topic)) for topic in topics}
-        print(json.dumps(told, indent=2, allow_nan=False) if self.json else "\n".join(_in_words(told)))
+        from linemap_jax.io.log import printable
+
+        words = json.dumps(told, indent=2, allow_nan=False) if self.json else "\n".join(map(printable, _in_words(told)))
+        print(words)
         return 0
 
 

@@ -7,6 +7,7 @@ pole's, and both move with the viewpoint. Where there are points enough the defa
 instead, for noise along and across the beams.
 """
 
+import dataclasses
 import math
 from typing import NamedTuple
 
@@ -21,7 +22,7 @@ from linemap_jax.core.propagation import apply, inverse, product, safe_sqrt, squ
 from linemap_jax.core.runs import Runs
 from linemap_jax.core.sensor import Points
 from linemap_jax.core.settings import Jacobians, SensorNoise, Thresholds
-from linemap_jax.core.slots import directed, neutral_where_free
+from linemap_jax.core.slots import bounded, directed, neutral_where_free
 from linemap_jax.core.state import Circles, Lines, Pose, squared
 
 MIN_FIT_POINTS = 5
@@ -199,7 +200,7 @@ def measure_circles(
         times_detected=jnp.ones_like(clusters.last),
         valid=clusters.valid,
     )
-    return neutral_where_free(circles)
+    return neutral_where_free(dataclasses.replace(circles, valid=circles.valid & bounded(circles)))
 
 
 def _fit_circles(

@@ -14,6 +14,7 @@ from linemap_jax.core.runs import select_runs
 from linemap_jax.core.segmentation import incremental, optimal
 from linemap_jax.core.sensor import Points, points_from_scan
 from linemap_jax.core.settings import (
+    LEAST_SIGMA,
     SCAN_CAPACITY,
     Capacity,
     Covariance,
@@ -24,8 +25,12 @@ from linemap_jax.core.settings import (
     SensorNoise,
     Thresholds,
 )
-from linemap_jax.core.slots import neutral_where_free
+from linemap_jax.core.slots import LARGEST, neutral_where_free
 from linemap_jax.core.state import Extraction, Pose, Rejected, Scan, Status
+
+
+ONE_AND_ROUNDING = 1.001
+"""The square of the largest correlation that is taken for one."""
 
 
 @partial(jax.jit, static_argnames=("capacity", "rules", "segmentation", "max_vertices", "covariance", "jacobians"))
@@ -136,7 +141,9 @@ def observe(
 def usable(scan: Scan, pose: Pose) -> tuple[Scan, Pose, Bool[Array, ""]]:
     """A scan and a pose without anything that is not finite, and whether the pose was finite.
 
-    What stands in a masked beam may be anything; a scan with a pose that is not finite loses all its beams.
+    What stands in a masked beam may be anything; a scan with a pose that is not finite loses all its beams. What is
+    beyond `LARGEST` counts as infinite, and so does the pose where its covariance is none: variances are not negative,
+    and correlations, up to rounding, not beyond one. No heading is less known than to half a turn.
 
     Args:
       scan: `N` beams.
@@ -145,9 +152,15 @@ def usable(scan: Scan, pose: Pose) -> tuple[Scan, Pose, Bool[Array, ""]]:
     Returns:
       The scan, the pose, and whether the pose was finite.
     """
-    finite = jnp.all(jnp.isfinite(pose.mean)) & jnp.all(jnp.isfinite(pose.cov))
-    valid = scan.valid & finite
+    variance = jnp.diagonal(pose.cov)
+    finite = jnp.all(jnp.abs(pose.mean) <= LARGEST) & jnp.all((variance >= 0) & (variance <= LARGEST))
+    finite &= jnp.all(pose.cov**2 <= ONE_AND_ROUNDING * variance[:, None] * variance[None])
+    valid = scan.valid & finite & (scan.ranges <= LARGEST) & (jnp.abs(scan.bearings) <= LARGEST)
     ranges, bearings = (jnp.where(valid, x, 0) for x in (scan.ranges, scan.bearings))
+    # A sigma of many turns says no more than one of half a turn, and float32 would lose all else beside it.
+    heading = jnp.where(variance[2] > jnp.pi**2, jnp.pi * jax.lax.rsqrt(jnp.maximum(variance[2], 1)), 1)
+    known = jnp.ones_like(variance).at[2].set(heading)
+    pose = dataclasses.replace(pose, cov=pose.cov * known[:, None] * known[None])
     pose = jax.tree.map(lambda x: jnp.where(finite, x, 0), pose)
     return dataclasses.replace(scan, ranges=ranges, bearings=bearings, valid=valid), pose, finite
 
@@ -269,8 +282,9 @@ def with_defaults(
     Returns:
       All three, as arrays of that dtype.
     """
-    settings = (thresholds or Thresholds(), noise or SensorNoise(), mount or Mount())
-    return as_dtype(settings, dtype)
+    thresholds, noise, mount = as_dtype((thresholds or Thresholds(), noise or SensorNoise(), mount or Mount()), dtype)
+    noise = dataclasses.replace(noise, range_sigma=jnp.maximum(noise.range_sigma, LEAST_SIGMA))
+    return thresholds, noise, mount
 
 
 def as_dtype(tree: Any, dtype: Any) -> Any:

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from linemap_jax.core.frames import dot, perp, shift_matrix, unit, wrap_angle
 from linemap_jax.core.matching import CircleMatches, compare_lines, with_sign
-from linemap_jax.core.propagation import apply, inverse, product, propagate, safe_sqrt, square_root, symmetric
+from linemap_jax.core.propagation import apply, inverse, product, safe_sqrt, square_root, symmetric
 from linemap_jax.core.settings import Number, PoseError, Rules, Thresholds
 from linemap_jax.core.slots import choose, least, take
 from linemap_jax.core.state import Circles, Lines, Pose, pytree, squared
@@ -43,8 +43,8 @@ ErrorsT = TypeVar("ErrorsT", Errors, Lines, Circles)
 def combine(old: Errors, new: Errors, pose_error: PoseError) -> tuple[Float[Array, "*s n n"], Errors]:
     """The gain K of x = x_old + K (x_new - x_old), and the error of x: Eq. (23) for both parts of the error.
 
-    Whatever the gain, the independent part is (I - K) C_old (I - K)^T + K C_new K^T, which no rounding makes
-    indefinite. With A_old and A_new for the square roots of what persists:
+    Whatever the gain, the independent part is (I - K) C_old (I - K)^T + K C_new K^T, formed as squares, which
+    no rounding makes indefinite. With A_old and A_new for the square roots of what persists:
 
     "independent" and "persistent": both errors hold the same u (if there is any), and their parts add up as
     (I - K) A_old + K A_new. With D = A_new - A_old the best gain is
@@ -81,7 +81,8 @@ def combine(old: Errors, new: Errors, pose_error: PoseError) -> tuple[Float[Arra
     unit = inverse(symmetric(innovation))
     gain = product(before, unit)
     keep = jnp.broadcast_to(jnp.eye(gain.shape[-1], dtype=gain.dtype), gain.shape) - gain
-    independent = propagate(keep, c_old) + propagate(gain, c_new)
+    # Squares of roots: of K C K^T, multiplied out, a large gain leaves rounding errors larger than C.
+    independent = squared(product(keep, square_root(c_old))) + squared(product(gain, square_root(c_new)))
     if pose_error == "unknown":
         a_old, a_new = product(keep, a_old), product(gain, a_new)
         # 1 / w = 1 + b / a and 1 / (1 - w) = 1 + a / b, with a and b the sizes of both terms
@@ -225,8 +226,9 @@ def _fuse_ends(
     scans at 5 cm of pose error). By default end points that agree within their spread are averaged by their variances;
     an observed end well beyond the old one replaces it, and one well short of it (the rest was hidden) does nothing.
     """
-    tangent = model.tangent
-    along = jnp.stack([dot(tangent, end - model.anchor) for end in (pieces.begin, pieces.end)], -1)
+    # From anchor to anchor: coordinates of the world have fewer digits far from its origin.
+    middle = pieces.anchor - model.anchor + pieces.offset[:, None] * pieces.normal
+    along = dot(model.tangent, middle)[:, None] + dot(model.tangent, pieces.tangent)[:, None] * pieces.extent
 
     def outermost(direction: int, old: Array, var_old: Array) -> tuple[Array, Array]:
         """The lower end for direction -1, the upper one for +1, in coordinates in which larger is longer."""

@@ -21,8 +21,8 @@ from linemap_jax.core.runs import Runs
 from linemap_jax.core.segmentation.incremental import Run, gap_gate
 from linemap_jax.core.sensor import Points, cov_point
 from linemap_jax.core.settings import Covariance, Jacobians, Rules, SensorNoise, Thresholds
-from linemap_jax.core.slots import earliest_true, latest_true, neutral_where_free
-from linemap_jax.core.state import Lines, Pose, pytree
+from linemap_jax.core.slots import bounded, earliest_true, latest_true, neutral_where_free
+from linemap_jax.core.state import Lines, Pose, pytree, squared
 
 MIN_POINTS = 3
 """At least three points are necessary to define a line (s4.3.1)."""
@@ -268,7 +268,8 @@ def measure_lines(
     from_pose = product(jac, points.jac_pose)
     spread = product(from_noise, jnp.swapaxes(from_noise, -1, -2))
     if covariance == "printed":
-        spread, from_pose = spread + propagate(from_pose, pose.cov), jnp.zeros_like(from_pose)
+        # By a square root, as rounding must not make it indefinite where the pose is sure of a direction.
+        spread, from_pose = spread + squared(product(from_pose, square_root(pose.cov)[None])), jnp.zeros_like(from_pose)
     elif covariance != "exact":
         raise ValueError(f"covariance must be 'exact' or 'printed', not {covariance!r}")
     sums = runs.sum(jnp.concatenate([spread, from_pose], -1))
@@ -286,7 +287,9 @@ def measure_lines(
         times_detected=jnp.ones_like(runs.first),
         valid=runs.valid,
     )
-    return neutral_where_free(lines), jac_line_pose, cov_measurement
+    lines = dataclasses.replace(lines, valid=lines.valid & bounded(lines))
+    measured = lines.valid[:, None, None]
+    return neutral_where_free(lines), jnp.where(measured, jac_line_pose, 0), jnp.where(measured, cov_measurement, 0)
 
 
 def line_extent(
@@ -425,7 +428,7 @@ def _var_extent(
         cov = cov_point(points.jac_pose[at], points.jac_measurement[at], pose.cov, noise)
         # A grazing beam says nothing about the end; 0.1 is 6 degrees.
         step = points.spacing * points.range[at] / jnp.maximum(jnp.abs(dot(normal, points.beam[at])), 0.1)
-        return quadratic(tangent, cov) + step**2 / 12
+        return jnp.maximum(quadratic(tangent, cov), 0) + step**2 / 12  # rounding may leave less than nothing
 
     return jnp.stack([end(runs.first), end(runs.last)], -1)
 

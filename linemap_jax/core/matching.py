@@ -83,13 +83,15 @@ def compare_lines(new: Lines, model: Lines, thresholds: Thresholds, pose_error: 
         var_offset = var_offset + jnp.sum(by_offset**2)
     det = var_offset * var_angle - covariance**2
     weighted = var_angle * offset**2 - 2 * covariance * offset * turn + var_offset * turn**2
-    nis = jnp.where(det > 0, weighted / jnp.where(det > 0, det, 1), 0)
+    # Negative by rounding alone
+    nis = jnp.where(det > 0, jnp.maximum(weighted, 0) / jnp.where(det > 0, det, 1), 0)
 
     # Gates are compared as squares; that saves the square roots.
     near = turn**2 < jnp.maximum(thresholds.match_angle**2, thresholds.match_sigmas**2 * var_angle)
     along = []
-    for end in (new.begin, new.end):
-        from_anchor = end - model.anchor
+    middle = new.offset * new.normal - step
+    for end in (new.extent[0], new.extent[1]):
+        from_anchor = middle + end * new.tangent
         s = dot(tangent, from_anchor)
         across = dot(normal, from_anchor) - model.offset
         from_new = s + lever

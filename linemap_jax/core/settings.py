@@ -20,6 +20,10 @@ Jacobians = Literal["autodiff", "analytic"]
 PoseError = Literal["independent", "persistent", "unknown"]
 
 
+LEAST_SIGMA = 1e-6
+"""m, of a range. Its square, and the determinant of a line's covariance, are still normal numbers in float32."""
+
+
 @pytree
 class Thresholds:
     """Where the method draws its lines. A gate is the larger of a distance and a multiple of the predicted spread.
@@ -80,7 +84,7 @@ class SensorNoise:
     """Standard deviations of one measurement, the square roots of C_s in Eq. (4)."""
 
     range_sigma: Number = 0.02
-    """Of a range, m."""
+    """Of a range, m. Less than a micrometre counts as one: without noise covariances would be singular."""
     bearing_sigma: Number = 0.001
     """Of a bearing, rad."""
 

@@ -115,6 +115,15 @@ def neutral_where_free(slots: SlotsT) -> SlotsT:
     return choose(slots.valid, slots, _empty_like(slots, slots.valid.shape[0]))
 
 
+LARGEST = 1e9
+"""Of the numbers of a primitive or pose, in m, rad and their squares: products of four such are finite in float32."""
+
+
+def bounded(slots: SlotsT) -> Bool[Array, " K"]:
+    """The lines or circles whose numbers are all finite, and none beyond `LARGEST`."""
+    return jnp.all(jnp.abs(_packed(slots)[0]) <= LARGEST, 0)
+
+
 def choose(first: Bool[Array, " K"], a: TreeT, b: TreeT) -> TreeT:
     """The items of `a` where `first` holds, of `b` elsewhere."""
     return jax.tree.map(lambda x, y: jnp.where(first.reshape(first.shape + (1,) * (x.ndim - 1)), x, y), a, b)

@@ -73,7 +73,8 @@ class Status(enum.IntFlag):
     MAP_FULL = MAP_LINES_FULL | MAP_CIRCLES_FULL
     """Either; `grow` makes room."""
     POSE_NOT_FINITE = 16
-    """The pose or its covariance held NaN or infinity; the scan was left out. Of odometry: the step was."""
+    """The pose or its covariance held NaN, infinity or numbers beyond 1e9, or the covariance was none; the scan was
+    left out. Of odometry: the step was."""
     LOST = 32
     """The map has not explained the latest scans: the robot is not where it is said to be, or not in this map."""
 

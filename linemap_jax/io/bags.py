@@ -51,6 +51,9 @@ MAX_PENDING = 2000
 MAX_SWEEP = 2.0
 """s. No scanner takes longer for a sweep; a time between beams that says so is not believed."""
 
+MAX_BEARING = 4 * math.pi
+"""rad. What goes around more than twice, or begins there, is no sweep."""
+
 MAX_SIGMA = (100.0, 100.0, math.pi)
 """m, m, rad. Covariances of more than this say that the pose is not known, and are not taken for its noise."""
 
@@ -243,9 +246,9 @@ class _Plan:
         angles = (message.angle_min, message.angle_increment)
         if beams == 0:
             raise Fault("the LaserScan has no ranges")
-        if not all(map(math.isfinite, angles)) or (angles[1] == 0 and beams > 1):
+        if not all(map(math.isfinite, angles)) or (angles[1] == 0 and beams > 1) or abs(angles[0]) > MAX_BEARING:
             raise Fault(f"angle_min {angles[0]:g} and angle_increment {angles[1]:g} of {beams} beams are no sweep")
-        if self._options.bearing_override is None and abs(angles[1]) * (beams - 1) > 4 * math.pi:
+        if self._options.bearing_override is None and abs(angles[1]) * (beams - 1) > MAX_BEARING:
             raise Fault(f"{beams} beams at an angle_increment of {angles[1]:g} rad go around more than twice")
         stamp = _seconds(message.header.stamp)
         if stamp == 0:
@@ -324,7 +327,10 @@ class _Plan:
         if chain is not None:
             transform = chain.transform_at(stamp)
             self._mount = planar(transform)
-            above = compose(self.poses.transform_at(stamp), transform) if isinstance(self.poses, Chain) else transform
+            poses = self.poses
+            above = transform
+            if isinstance(poses, Chain) and poses.known:
+                above = compose(poses.transform_at(stamp), transform)
             cosine = upright(above)
             self._hangs = cosine < 0
             notes.mounting = f"tf, {self._laser} in {self._robot}{', upside down' if self._hangs else ''}"

@@ -19,6 +19,12 @@ POSITIVE = {"range_sigma"}
 """Keys that may not be zero: without noise in the ranges every covariance would be singular."""
 
 
+LARGEST = 1e15
+"""Of what has a unit: its square is still finite in float32."""
+
+_MOST_TOLD = 80  # characters
+
+
 class ConfigError(Exception):
     """What is wrong with a settings file: one sentence that names the file and the cause."""
 
@@ -40,26 +46,20 @@ def read_config(path: str | os.PathLike[str]) -> dict[str, dict[str, Any]]:
         tables = tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(f"cannot read {os.fspath(path)}: {error.strerror or error}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # no TOML, no text, or a number of thousands of digits
         raise ConfigError(f"{os.fspath(path)} is not a TOML file: {error}") from error
     for section, table in tables.items():
         if section not in SECTIONS:
-            raise ConfigError(f"{os.fspath(path)}: no table [{section}]{_nearest(section, SECTIONS)}")
+            raise ConfigError(f"{os.fspath(path)}: no table [{_told(section)[1:-1]}]{_nearest(section, SECTIONS)}")
         if not isinstance(table, dict):
             raise ConfigError(f"{os.fspath(path)}: {section} must be a table, [{section}]")
         fields = {field.name for field in dataclasses.fields(SECTIONS[section])}
         for key, value in table.items():
             if key not in fields:
-                raise ConfigError(f"{os.fspath(path)}: no key {key!r} in [{section}]{_nearest(key, fields)}")
-            is_switch = section == "rules"
-            if isinstance(value, bool) != is_switch or not isinstance(value, int | float):
-                kind = "true or false" if is_switch else "a number"
-                raise ConfigError(f"{os.fspath(path)}: {key} in [{section}] must be {kind}, not {value!r}")
-            if not is_switch and not (0 <= value < float("inf") and (value > 0 or key not in POSITIVE)):
-                kind = "positive" if key in POSITIVE else "zero or positive"
-                raise ConfigError(f"{os.fspath(path)}: {key} in [{section}] must be {kind}, not {value}")
-            if section == "persistence" and value > 1:
-                raise ConfigError(f"{os.fspath(path)}: {key} in [{section}] must be at most 1, not {value}")
+                raise ConfigError(f"{os.fspath(path)}: no key {_told(key)} in [{section}]{_nearest(key, fields)}")
+            wanted = _wanted(section, key, value)
+            if wanted is not None:
+                raise ConfigError(f"{os.fspath(path)}: {key} in [{section}] must be {wanted}, not {_told(value)}")
     return tables
 
 
@@ -78,6 +78,27 @@ def config_text(settings: Mapping[str, Any]) -> str:
             lines += [*textwrap.wrap(meaning, 96, initial_indent="# ", subsequent_indent="# "), f"{name} = {told}"]
         blocks.append("\n".join(lines))
     return "\n\n".join(blocks) + "\n"
+
+
+def _wanted(section: str, key: str, value: Any) -> str | None:
+    """What a value should be and is not; None if it may stand there."""
+    if section == "rules":
+        return None if isinstance(value, bool) else "true or false"
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return "a number"
+    if not (0 <= value < float("inf") and (value > 0 or key not in POSITIVE)):
+        return "positive" if key in POSITIVE else "zero or positive"
+    largest = 1 if section == "persistence" else LARGEST
+    return f"at most {largest:g}" if value > largest else None
+
+
+def _told(value: Any) -> str:
+    """A value or name of the file, as it may stand in a message."""
+    try:
+        said = ascii(value)
+    except ValueError:  # Python does not print an integer of thousands of digits
+        return "what it is"
+    return said if len(said) <= _MOST_TOLD else f"{said[:_MOST_TOLD]}..."
 
 
 def _nearest(name: str, known: Iterable[str]) -> str:

@@ -19,6 +19,9 @@ IDENTITY: Transform = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 KEPT = 10.0
 """s. Transforms older than this, against the latest one, are forgotten."""
 
+FARTHEST = 1e12
+"""m. Where a coordinate is larger, float64 no longer tells millimetres, and products of several overflow."""
+
 _SAME = 1e-4  # m, and rad: a frame that moves by less stands still
 
 
@@ -27,7 +30,7 @@ def transform_of(translation: Iterable[float], rotation: Iterable[float]) -> Tra
     x, y, z = map(float, translation)
     a, b, c, d = map(float, rotation)
     norm = math.sqrt(a * a + b * b + c * c + d * d)
-    if not (math.isfinite(x + y + z) and 1e-6 < norm < math.inf):
+    if not (max(abs(x), abs(y), abs(z)) <= FARTHEST and 1e-6 < norm < math.inf) or math.isnan(x + y + z):
         return None
     return x, y, z, a / norm, b / norm, c / norm, d / norm
 
@@ -205,6 +208,11 @@ class Track:
             old = bisect_left(stamps, stamps[-1] - KEPT)
             del stamps[:old], self._transforms[:old], self._covs[:old]
 
+    @property
+    def known(self) -> bool:
+        """Whether it was told at all."""
+        return self._latest is not None
+
     def clear(self) -> None:
         """Forget all stamps; a transform that never changed still holds."""
         self._stamps.clear()
@@ -214,7 +222,7 @@ class Track:
     def covers(self, begin: float, end: float) -> bool:
         """Whether it is known from one stamp to another. s."""
         if not self.moves:
-            return self._latest is not None
+            return self.known
         return bool(self._stamps) and self._stamps[0] <= begin and end <= self._stamps[-1]
 
     def at(self, stamp: float) -> Transform:
@@ -252,6 +260,11 @@ class Chain:
     def moves(self) -> bool:
         """Whether any track has ever changed."""
         return any(track.moves for track in (*self.up, *self.down))
+
+    @property
+    def known(self) -> bool:
+        """Whether every track was told at all."""
+        return all(track.known for track in (*self.up, *self.down))
 
     def covers(self, begin: float, end: float) -> bool:
         """Whether the poses from one stamp to another are known. s."""

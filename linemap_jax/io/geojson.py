@@ -52,7 +52,7 @@ def document_from_features(document: dict[str, Any]) -> dict[str, Any]:
         if not isinstance(properties, dict) or not isinstance(geometry, dict):
             raise ValueError(f"features[{i}] must have properties and a geometry")
         kind = properties.get("kind")
-        if kind not in _LIST:
+        if not isinstance(kind, str) or kind not in _LIST:
             raise ValueError(f'features[{i}] must have the kind "line" or "circle", not {json.dumps(kind)}')
         places = geometry.get("coordinates")
         if geometry.get("type") != _GEOMETRY[kind] or not isinstance(places, list):

@@ -60,7 +60,12 @@ class LogError(Exception):
 
     def __str__(self) -> str:
         """One sentence: file, place, cause."""
-        return f"{self.path}{'' if self.where is None else f', {self.where}'}: {self.cause}"
+        return f"{self.path}{'' if self.where is None else f', {self.where}'}: {printable(self.cause)}"
+
+
+def printable(text: str) -> str:
+    """Text on one line, whatever names a log has for its topics and frames: what is no print stands as its escape."""
+    return text if text.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -170,7 +175,7 @@ class Notes:
         if self.other_beam_counts:
             others = f"{_scans(self.other_beam_counts)} with other than the {self.beam_count} of the first"
             said.append(f"the number of beams varies: {others}")
-        return said + self.assumptions
+        return [printable(sentence) for sentence in said + self.assumptions]
 
     def _places(self, listed: list[int], count: int) -> str:
         return f"{self.unit}{'' if count == 1 else 's'} {', '.join(map(str, listed))}{', ...' * (count > len(listed))}"

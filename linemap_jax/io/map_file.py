@@ -23,6 +23,7 @@ from linemap_jax.core.settings import Capacity
 from linemap_jax.core.state import Circles, LineMap, Lines, SlotsT, empty_circles, empty_lines
 from linemap_jax.io.atomic import OutputError, atomic_write
 from linemap_jax.io.geojson import TYPE, document_from_features, features_from_document
+from linemap_jax.io.json_file import JsonError, read_json
 
 Columns = dict[str, NDArray[Any]]
 """Field -> its values of all lines or circles; the first axis counts them, there are no free slots."""
@@ -240,19 +241,12 @@ def _text(document: dict[str, Any]) -> str:
 
 def _load(path: str | os.PathLike[str]) -> dict[str, Any]:
     """The document, its head checked."""
-
-    def refuse(name: str) -> None:
-        raise _Fault(f"holds {name}, a number that is not finite")
-
     try:
-        with open(path, encoding="utf-8") as file:
-            document = json.load(file, parse_constant=refuse)
+        document = read_json(path)
     except OSError as error:
         raise MapFileError(f"cannot read {os.fspath(path)}: {error.strerror or error}") from error
-    except json.JSONDecodeError as error:
-        raise _Fault(f"line {error.lineno} is not JSON: {error.msg}") from None
-    except (UnicodeDecodeError, RecursionError):
-        raise _Fault("is not JSON") from None
+    except JsonError as error:
+        raise _Fault(str(error)) from None
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         raise _Fault(f'is not a map: "format" must be "{FORMAT}"')
     if document.get("type") == TYPE:
@@ -281,6 +275,7 @@ def _read_lines(document: dict[str, Any]) -> Columns:
     for name in ("cov", "cov_local"):
         _check_cov(columns[name], "lines", name, slack=_ROUNDING)
     _check_cov(columns["cov_independent"], "lines", "cov_independent")
+    _check_parts(columns, "lines", "cov_local")
     _check(columns["extent"][:, 0] <= columns["extent"][:, 1], "lines", "extent", "runs backwards")
     _check(columns["var_extent"].min(1) >= 0, "lines", "var_extent", "is negative")
     for name, along in zip(("begin", "end"), columns["extent"].T, strict=True):
@@ -301,6 +296,7 @@ def _read_circles(document: dict[str, Any]) -> Columns:
     fits = {name: _column(entries, "circles", name, shape, dtype) for name, shape in shapes.items()}
     _check_cov(fits["cov"], "circles", "cov", exempt=~fitted, slack=_ROUNDING)
     _check_cov(fits["cov_independent"], "circles", "cov_independent", exempt=~fitted)
+    _check_parts(fits, "circles", "cov")
     state = {name: fits[name] for name in _FIT_STATE}
     return columns | state | {"fitted": fitted} | _counts(entries, "circles")
 
@@ -356,6 +352,20 @@ def _check_cov(
     symmetric = np.abs(correlation - np.swapaxes(correlation, -1, -2)).max((-2, -1), initial=0) <= _ROUNDING
     definite = (variance > 0).all(-1) & (np.linalg.eigvalsh(correlation).min(-1, initial=1) > -slack)
     _check(symmetric & definite | exempt, kind, name, "is not symmetric positive definite")
+
+
+def _check_parts(columns: Columns, kind: str, name: str) -> None:
+    """Refuse a covariance that is not the sum of its two parts: they alone are read, and somebody has changed them."""
+    stated, independent, root = (columns[f].astype(np.float64) for f in (name, "cov_independent", "sqrt_persistent"))
+    both = independent + root @ np.swapaxes(root, -1, -2)
+    sigma = np.sqrt(np.maximum(np.diagonal(both, axis1=-2, axis2=-1), 0))
+    excess = np.abs(stated - both) - _ROUNDING * sigma[:, :, None] * sigma[:, None, :]
+    _check(
+        excess.max((-2, -1), initial=-np.inf) <= 0,
+        kind,
+        name,
+        "is not the sum of its two parts",
+    )
 
 
 def _check_on_line(columns: Columns, name: str, along: NDArray[Any]) -> None:

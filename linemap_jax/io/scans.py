@@ -85,7 +85,9 @@ def _scans(batch: list[Reading], width: int, dtype: Any) -> Scan:
             ranges[row, :beams], bearings[row, :beams] = at_first_beam(
                 ranges[row, :beams], bearings[row, :beams], reading.sweep_poses, reading.mount or (0.0, 0.0, 0.0)
             )
-    ranges, bearings, spacing = (x.astype(dtype) for x in (ranges, bearings, spacing))
+    with np.errstate(over="ignore"):  # what is too large or too small for float32 is no point
+        ranges, bearings, spacing = (x.astype(dtype) for x in (ranges, bearings, spacing))
+    valid &= (ranges > 0) & np.isfinite(ranges)
     valid, first = close_sweep(ranges, bearings, valid, spacing)
     return Scan(
         ranges=jnp.asarray(np.where(valid, ranges, 0)),

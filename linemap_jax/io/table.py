@@ -17,6 +17,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from linemap_jax.io.atomic import atomic_write
+from linemap_jax.io.log import printable
 
 Columns = Mapping[str, NDArray[Any]]
 """Name -> values; the first axis counts the rows."""
@@ -49,7 +50,7 @@ class ResultsTable:
             self.folder.mkdir(parents=True, exist_ok=True)
             here = sorted(path.name for path in self.folder.iterdir() if not path.name.startswith("."))
             if ABOUT in here:
-                if (self.folder / ABOUT).read_text(encoding="utf-8") != text:
+                if (self.folder / ABOUT).read_bytes() != text.encode():
                     raise TableError(f"{self.folder} holds the results of another experiment, see {ABOUT} in it")
             elif here:
                 raise TableError(f"{self.folder} is not empty and holds no table of results")
@@ -89,7 +90,7 @@ class ResultsTable:
         (count,) = counts
         table = pa.table({name: pa.array(np.asarray(values).tolist()) for name, values in columns.items()})
         with atomic_write(self.folder / f"rows-{first:09d}-{count:09d}.parquet", overwrite=False) as path:
-            pq.write_table(table, path)
+            pq.write_table(table, path, write_page_checksum=True)
         self.rows += count
 
     def read(self) -> dict[str, NDArray[Any]]:
@@ -98,14 +99,24 @@ class ResultsTable:
         Raises:
           TableError: if a file is damaged.
         """
-        try:
-            parts = [
-                pq.read_table(self.folder / f"rows-{first:09d}-{count:09d}.parquet")
-                for first, count in self._parts().items()
-            ]
-        except (OSError, pa.ArrowException) as error:
-            raise TableError(f"cannot read the table in {self.folder}: {error}") from error
+        parts = []
+        for first, count in self._parts().items():
+            name = f"rows-{first:09d}-{count:09d}.parquet"
+            where = f"the table in {self.folder}, {name}"
+            try:
+                part = pq.read_table(self.folder / name, page_checksum_verification=True)
+                part.schema.names  # noqa: B018  raises where a name is no text
+            except (OSError, UnicodeDecodeError, pa.ArrowException) as error:
+                raise TableError(f"cannot read {where}: {_told(error)}") from error
+            if part.num_rows != count or (parts and part.schema != parts[0].schema):
+                raise TableError(f"cannot read {where}: it holds other rows or columns than it should")
+            parts.append(part)
         if not parts:
             return {}
         whole = pa.concat_tables(parts)
         return {name: np.asarray(whole.column(name).to_pylist()) for name in whole.column_names}
+
+
+def _told(error: Exception) -> str:
+    """What an exception of the library says, in one line."""
+    return printable(" ".join(str(error).split()).rstrip("."))

@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from linemap_jax.io.atomic import OutputError, atomic_write
+from linemap_jax.io.json_file import JsonError, read_json
 
 Columns = dict[str, NDArray[Any]]
 
@@ -138,19 +139,12 @@ def write_world(path: str | os.PathLike[str], world: Mapping[str, Any], *, overw
 
 def _load(path: str | os.PathLike[str]) -> dict[str, Any]:
     """The document, its head checked."""
-
-    def refuse(name: str) -> None:
-        raise _Fault(f"holds {name}, a number that is not finite")
-
     try:
-        with open(path, encoding="utf-8-sig") as file:
-            document = json.load(file, parse_constant=refuse)
+        document = read_json(path)
     except OSError as error:
         raise WorldFileError(f"cannot read {os.fspath(path)}: {error.strerror or error}") from error
-    except json.JSONDecodeError as error:
-        raise _Fault(f"line {error.lineno} is not JSON: {error.msg}") from None
-    except (UnicodeDecodeError, RecursionError):
-        raise _Fault("is not JSON") from None
+    except JsonError as error:
+        raise _Fault(str(error)) from None
     if not isinstance(document, dict) or document.get("type") != "FeatureCollection":
         raise _Fault('is not a world: its "type" must be "FeatureCollection"')
     if document.get("format", FORMAT) != FORMAT or document.get("version", VERSION) != VERSION:
@@ -169,7 +163,7 @@ def _read_feature(feature: Any, where: str, dtype: str) -> tuple[str, NDArray[An
     if not isinstance(geometry, dict) or not isinstance(properties, dict):
         raise _Fault(f"{where} must have a geometry, and properties that are an object")
     shape = geometry.get("type")
-    if shape not in _DEFAULT_KIND:
+    if not isinstance(shape, str) or shape not in _DEFAULT_KIND:
         raise _Fault(f"{where} is a {json.dumps(shape)}; it must be a LineString, a Polygon or a Point")
     kind = properties.get("kind", _DEFAULT_KIND[shape])
     allowed = {"LineString": ("wall", "path"), "Polygon": ("room", "obstacle"), "Point": ("pole", "path")}[shape]

@@ -309,6 +309,29 @@ def test_persistent_is_a_kalman_filter_that_considers_the_pose_error() -> None:
         np.testing.assert_allclose(mine.cov_independent[0] + root @ root.T, p[:2, :2], rtol=1e-7, atol=1e-10)
 
 
+def test_a_large_gain_leaves_a_covariance_in_float32() -> None:
+    """Views that differ in what persists by far more than by noise, one of them much surer of one direction."""
+    random = np.random.default_rng(0)
+    n = 2000
+
+    def errors(lever: np.ndarray, cov: np.ndarray) -> Errors:
+        root = np.zeros((n, 2, 3))
+        root[:, 0, 0], root[:, 1, 0] = lever, 1.0
+        times = jnp.ones(n, int)
+        return in_float32(
+            Errors(cov_independent=jnp.asarray(cov), sqrt_persistent=jnp.asarray(root), times_detected=times)
+        )
+
+    unsure = np.stack([np.cos(angle := random.uniform(0, np.pi, n)), np.sin(angle)], -1)
+    cov = 1e-12 * (unsure[:, :, None] * unsure[:, None] + 1e-5 * np.eye(2))
+    lever = random.normal(size=n)
+    new = errors(lever + 0.1 * random.normal(size=n), np.tile(1e-12 * np.eye(2), (n, 1, 1)))
+    _, joint = combine(errors(lever, cov), new, "persistent")
+    fused = np.asarray(joint.cov_independent, float)
+    sigma = np.sqrt(np.diagonal(fused, axis1=-2, axis2=-1))
+    assert np.linalg.eigvalsh(fused / (sigma[:, :, None] * sigma[:, None])).min() > -1e-5
+
+
 def test_pieces_move_with_the_pose_as_their_line_did_at_first() -> None:
     """Against the motion of a line by a displaced robot, by central differences; from both sides."""
     pose = Pose(mean=jnp.array([1.0, -2.0, 0.3]), cov=jnp.array([[4e-4, 1e-4, 0], [1e-4, 9e-4, 2e-5], [0, 2e-5, 1e-4]]))

@@ -468,6 +468,7 @@ def test_another_definition_of_the_message_is_refused(tmp_path):
         ({"ranges": []}, "has no ranges"),
         ({"angle_increment": 0.0}, "are no sweep"),
         ({"angle_min": math.nan}, "are no sweep"),
+        ({"angle_min": 1e30}, "are no sweep"),
         ({"angle_increment": 3.0}, "more than twice"),
     ],
 )
@@ -494,6 +495,29 @@ def test_poses_that_are_none_are_passed_over(tmp_path):
     recording.tf(100.0, "base_link", "camera", (0, 0, 0), (0, 0, 0, 0))  # no rotation
     readings, _ = read(recording.write(tmp_path))
     np.testing.assert_allclose([r.pose[0] for r in readings], [0.05, 0.15], atol=1e-7)
+
+
+def test_translations_beyond_all_measure_are_passed_over(tmp_path):
+    recording = drive(scans=2)
+    recording.odometry(100.04, (1.7e308, 0, 0))
+    recording.odometry(100.06, (-1.7e308, 0, 0))
+    readings, _ = read(recording.write(tmp_path))
+    np.testing.assert_allclose([r.pose[0] for r in readings], [0.05, 0.15], atol=1e-7)
+
+
+def test_scans_are_described_where_odometry_says_nothing(tmp_path):
+    recording = Recording()
+    recording.scan(1.0, RANGES)
+    recording.odometry(1.0, (math.nan, 0, 0))
+    (reading,), _ = read(recording.write(tmp_path), need_poses=False)
+    assert reading.pose is None
+
+
+def test_names_of_topics_do_not_break_the_sentence(tmp_path):
+    recording = Recording()
+    for topic in ("/a\nb", "/c"):
+        recording.scan(1.0, RANGES, topic=topic)
+    assert "/a\\nb (1), /c (1)" in refused(recording.write(tmp_path))
 
 
 def test_poses_of_another_time_are_no_poses(tmp_path):

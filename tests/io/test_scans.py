@@ -129,3 +129,14 @@ def test_a_full_turn_while_turning_sees_nothing_twice():
     seen = np.sort(np.asarray(scan.bearings[0])[np.asarray(scan.valid[0])])
     assert len(seen) < 356
     assert seen[-1] - seen[0] < 2 * np.pi
+
+
+def test_what_is_too_large_or_too_small_for_float32_is_no_point():
+    moving = np.tile([0.0, 0.0, 0.0], (4, 1))
+    moving[:, 2] = [0.0, 0.1, 0.2, 0.3]
+    first = reading([1.0, 1e-46, 1e39, 2.0], range_max=math.inf)
+    second = reading([1.0, 1.0, 1.0, 1.0], sweep_poses=moving, mount=(1e300, 0.0, 0.0))
+    (chunk,) = chunks_of_readings([first, second], 8, cov_pose=COV)
+    assert chunk.scans.valid[0].tolist() == [True, False, False, True]
+    assert not chunk.scans.valid[1, 1:].any()
+    assert all(np.isfinite(x).all() for x in (chunk.scans.ranges, chunk.scans.bearings))

@@ -1,5 +1,6 @@
 """Tables of results: whole or not there, resumed, never mixed up."""
 
+import contextlib
 import json
 
 import numpy as np
@@ -42,7 +43,7 @@ def test_a_full_disk_leaves_the_table_as_it_was(tmp_path, monkeypatch):
     table = ResultsTable(tmp_path, ABOUT_IT)
     table.append(0, rows(0, 2))
 
-    def full(*_):
+    def full(*_, **__):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(pq, "write_table", full)
@@ -81,6 +82,32 @@ def test_a_damaged_chunk_is_named(tmp_path):
     (tmp_path / "rows-000000000-000000002.parquet").write_bytes(b"PAR1 nonsense")
     with pytest.raises(TableError, match="cannot read the table"):
         table.read()
+
+
+def test_a_number_that_has_changed_on_the_disk_is_noticed(tmp_path):
+    table = ResultsTable(tmp_path, ABOUT_IT)
+    table.append(0, rows(0, 2))
+    path = tmp_path / "rows-000000000-000000002.parquet"
+    content = path.read_bytes()
+    for at in range(4, len(content) - 8, 7):
+        path.write_bytes(content[:at] + bytes([content[at] ^ 255]) + content[at + 1 :])
+        with contextlib.suppress(TableError):
+            np.testing.assert_array_equal(table.read()["nees"], np.arange(2) / 8)
+
+
+def test_a_chunk_of_other_rows_than_its_name_says_is_noticed(tmp_path):
+    table = ResultsTable(tmp_path, ABOUT_IT)
+    table.append(0, rows(0, 2))
+    (tmp_path / "rows-000000000-000000002.parquet").rename(tmp_path / "rows-000000000-000000003.parquet")
+    with pytest.raises(TableError, match="holds other rows or columns than it should"):
+        table.read()
+
+
+def test_a_description_that_is_no_text_is_that_of_another_experiment(tmp_path):
+    ResultsTable(tmp_path, ABOUT_IT)
+    (tmp_path / ABOUT).write_bytes(b"\xff\xfe")
+    with pytest.raises(TableError, match="another experiment"):
+        ResultsTable(tmp_path, ABOUT_IT)
 
 
 @pytest.mark.parametrize("first", [0, 3])

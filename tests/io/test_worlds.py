@@ -107,6 +107,7 @@ DAMAGES = {
     "feature": (change("features", 1, to=[1]), "features[1] must be an object"),
     "no geometry": (change("features", 2, "geometry", to=None), "features[2] must have a geometry"),
     "geometry": (shape(0, "type", to="MultiPoint"), 'features[0] is a "MultiPoint"; it must be'),
+    "no name": (shape(0, "type", to=["Point"]), 'features[0] is a ["Point"]; it must be'),
     "kind": (change("features", 2, "properties", "kind", to="wall"), 'features[2], a Polygon, has the kind "wall"'),
     "hole": (
         shape(2, "coordinates", to=[[[0, 0], [1, 0], [0, 1], [0, 0]]] * 2),
@@ -149,6 +150,7 @@ def test_names_the_file_and_what_is_wrong(tmp_path: Path, what: str) -> None:
         (b"\xff\xfe", "is not JSON"),
         (b"[" * 100_000, "is not JSON"),
         (b'{"type": "FeatureCollection", "features": [NaN]}', "holds NaN"),
+        (b'{"type": "FeatureCollection", "version": ' + b"9" * 5000 + b"}", "has format and version"),
         (b"[]", "is not a world"),
     ],
 )
