@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from linemap_jax.cli.fit import Fit, at_poses_of_map
 from linemap_jax.cli.logs import mount_of, opened, plain_chunks, progress, warn
 from linemap_jax.cli.merge import read_two_maps
 from linemap_jax.cli.options import LogInput, UsageError, check_input
@@ -54,21 +55,24 @@ class Compare(LogInput):
         if self.at_least < 1:
             raise UsageError(f"--at-least must be 1 or more, not {self.at_least}")
         check_input(self)
-        a, b, _ = read_two_maps(self.a, self.b)
+        a, b, settings = read_two_maps(self.a, self.b)
         from linemap_jax.build import CHUNK
         from linemap_jax.lab.comparison import compare_maps, looked_through
 
         options = {"within": self.within, "alpha": self.alpha, "shortest": self.shortest, "at_least": self.at_least}
         found = compare_maps(a, b, **options)
         logs: list[tuple[What, Path | None]] = [("appeared", self.log_a), ("vanished", self.log_b)]
-        for what, path in logs:
+        for (what, path), map_file, line_map, of_map in zip(logs, (self.a, self.b), (a, b), settings, strict=True):
             if path is not None:
-                log = opened(self, path)
-                mount = mount_of(self, log, quiet=self.quiet)
+                command = at_poses_of_map(self, path, map_file, of_map, quiet=self.quiet)
+                log = opened(command, path)
+                mount = mount_of(command, log, quiet=self.quiet)
+                fit = Fit(line_map, mount)
                 with progress(log, quiet=self.quiet):
-                    changes = looked_through(found.changes, plain_chunks(log), what, mount, chunk=CHUNK)
+                    changes = looked_through(found.changes, fit.through(plain_chunks(log)), what, mount, chunk=CHUNK)
                 found = found._replace(changes=changes)
                 warn(log, quiet=self.quiet)
+                fit.warn(log, map_file, quiet=self.quiet)
         print(json.dumps(_summary(self, found), indent=2) if self.json else _in_words(found))
         return 0
 

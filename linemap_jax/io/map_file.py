@@ -11,6 +11,7 @@ import dataclasses
 import json
 import os
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, Literal
 
 import jax
@@ -110,7 +111,7 @@ def read_map(
     """Read a map that `write_map` wrote, in either form.
 
     Args:
-      path: of the file.
+      path: of the file, or of a folder with a `map.json` in it.
       capacity: slots of the map; the next power of two unless given.
       dtype: of the map; that of the file unless given.
 
@@ -238,6 +239,12 @@ def _text(document: dict[str, Any]) -> str:
     return "{\n" + ",\n".join(parts) + "\n}\n"
 
 
+def map_in(path: str | os.PathLike[str]) -> Path:
+    """The file that is meant: of a folder, as `linemap build` writes it, the `map.json` in it."""
+    path = Path(path)
+    return path / "map.json" if path.is_dir() else path
+
+
 def _load(path: str | os.PathLike[str]) -> dict[str, Any]:
     """The document, its head checked."""
 
@@ -245,10 +252,10 @@ def _load(path: str | os.PathLike[str]) -> dict[str, Any]:
         raise _Fault(f"holds {name}, a number that is not finite")
 
     try:
-        with open(path, encoding="utf-8") as file:
+        with map_in(path).open(encoding="utf-8") as file:
             document = json.load(file, parse_constant=refuse)
     except OSError as error:
-        raise MapFileError(f"cannot read {os.fspath(path)}: {error.strerror or error}") from error
+        raise MapFileError(f"cannot read {map_in(path)}: {error.strerror or error}") from error
     except json.JSONDecodeError as error:
         raise _Fault(f"line {error.lineno} is not JSON: {error.msg}") from None
     except (UnicodeDecodeError, RecursionError):
