@@ -115,9 +115,10 @@ class Build(LogOptions):
         files = {"map": str(map_file), "picture": str(picture)} | ({"page": str(page)} if self.html else {})
         summary = _summary(self, line_map, report, options, seconds) | {"poses": tell_poses(self, log)} | files
         print(json.dumps(summary, indent=2) if self.json else _in_words(summary))
-        if summary["lines"] and summary["explained"] < FEW_EXPLAINED:
+        share = float(summary["explained"])
+        if summary["lines"] and share < FEW_EXPLAINED:
             say(
-                f"warning: {log.path}: only {summary['explained']:.0%} of its returns lie on the map: do its poses "
+                f"warning: {log.path}: only {share:.0%} of its returns lie on the map: do its poses "
                 "drift (`linemap slam` corrects them), does the laser sit elsewhere (--laser-offset), or is the noise "
                 "larger (--range-sigma, --pose-sigma)?",
                 quiet=self.quiet,

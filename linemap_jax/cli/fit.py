@@ -53,8 +53,8 @@ def at_poses_of_map(
     offset = command.laser_offset
     if offset is None and read_tum(trajectory).pose_frame == "robot":
         stated = of_slam.get("laser_offset")
-        known = isinstance(stated, list) and len(stated) == 3 and all(isinstance(x, int | float) for x in stated)
-        offset = (stated[0], stated[1], stated[2]) if known else None
+        if isinstance(stated, list) and len(stated) == 3 and all(isinstance(x, int | float) for x in stated):
+            offset = (stated[0], stated[1], stated[2])
     return dataclasses.replace(command, poses=trajectory, laser_offset=offset)
 
 
