@@ -10,7 +10,7 @@ import os
 # features of the CPU whenever compiled code comes from the cache on the disk. Real faults still come as exceptions.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
-from linemap_jax.build import build, build_chunks
+from linemap_jax.build import build, build_chunks, grow
 from linemap_jax.core.extract import extract
 from linemap_jax.core.lines import rho_theta
 from linemap_jax.core.mapping import empty_map, update
@@ -67,6 +67,7 @@ __all__ = [
     "LEFT_OUT",
     "build",
     "build_chunks",
+    "grow",
     "PAPER_RULES",
     "PAPER_THRESHOLDS",
     "SCAN_CAPACITY",

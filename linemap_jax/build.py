@@ -60,11 +60,12 @@ def build(
     Raises:
       ValueError: if there is no scan, if scans and poses differ in number, or for what `update` refuses.
     """
+    if scans.ranges.ndim != 2 or poses.mean.ndim != 2:
+        shapes = f"ranges {scans.ranges.shape} and poses {poses.mean.shape}"
+        raise ValueError(f"scans and poses must be stacked, with ranges [T, N] and poses [T, 3], not {shapes}")
     count = scans.ranges.shape[0]
     if poses.mean.shape[0] != count:
         raise ValueError(f"{count} scans and {poses.mean.shape[0]} poses: there must be one pose for each scan")
-    if scans.ranges.ndim != 2:
-        raise ValueError(f"scans must be stacked, with ranges [T, N], not {scans.ranges.shape}")
     pieces = ((_slice(scans, i, i + chunk), _slice(poses, i, i + chunk)) for i in range(0, count, chunk))
     reports = []
     built = line_map or empty_map(map_capacity, scans.ranges.dtype)
@@ -116,7 +117,9 @@ def build_chunks(
             full = Status(int(np.bitwise_or.reduce(np.asarray(report.status))))
             if not full & ~Status.POSE_NOT_FINITE:
                 break
-            line_map, capacity = _grow_map(line_map, full), _grow_scan(capacity, full)
+            if full & Status.MAP_FULL:
+                line_map = grow(line_map)
+            capacity = _grow_scan(capacity, full)
         line_map = after
         yield after, _slice(report, 0, count)
 
@@ -181,10 +184,17 @@ def update_chunk(
 _run = _jit(update_chunk)
 
 
-def _grow_map(line_map: LineMap, full: Status) -> LineMap:
-    """Twice the room for lines and circles where either ran out: the other soon would, and each growth is compiled."""
-    if not full & (Status.MAP_LINES_FULL | Status.MAP_CIRCLES_FULL):
-        return line_map
+def grow(line_map: LineMap) -> LineMap:
+    """A map with twice the slots for lines and circles: where either run out, the other soon would.
+
+    On the host; `update` is compiled once more for it.
+
+    Args:
+      line_map: the map.
+
+    Returns:
+      The same map, each primitive in its slot.
+    """
     lines, circles = line_map.lines, line_map.circles
     return LineMap(lines=resize(lines, 2 * lines.valid.shape[0]), circles=resize(circles, 2 * circles.valid.shape[0]))
 

@@ -237,16 +237,12 @@ class Slam:
           keyframes' poses.
         """
         count, dtype = len(self._poses), line_map.lines.offset.dtype
-        cov = np.diag(np.square(SIGMA_NEXT))
         numbers, pieces = np.arange(count), []
         width = max(scan.ranges.size for scan in self._keyframes.scan)
         for i in range(0, count, CHUNK):
             scans = _stacked(self._keyframes.scan[i : i + CHUNK], width)
             size = len(scans.ranges)
-            poses = Pose(
-                mean=jnp.asarray(self._poses[i : i + CHUNK], dtype),
-                cov=jnp.asarray(np.tile(cov, (size, 1, 1)), dtype),
-            )
+            poses = poses_for_map(self._poses[i : i + CHUNK], dtype)
             piece = pad_stack((scans, poses, jnp.asarray(numbers[i : i + CHUNK])), CHUNK)
             seen = _jit_sightings(*piece, line_map.lines, thresholds=thresholds, noise=noise, **options)
             pieces.append(jax.tree.map(partial(_flat, size), seen))
@@ -344,12 +340,26 @@ def slam(
     state, count, places = Slam(**settings), scans.ranges.shape[0], np.asarray(odometry)
     for i in range(0, count, CHUNK):
         state.add(_part(scans, i), places[i : i + CHUNK])
-    dtype = scans.ranges.dtype
-    cov = jnp.asarray(np.tile(np.diag(np.square(SIGMA_NEXT)), (count, 1, 1)), dtype)
-    poses = Pose(mean=jnp.asarray(state.trajectory(), dtype), cov=cov)
+    poses = poses_for_map(state.trajectory(), scans.ranges.dtype)
     line_map, _ = build(scans, poses, thresholds=thresholds, noise=noise, pose_error="unknown")
     line_map, cov_keyframes = state.adjust(line_map, thresholds=thresholds, noise=noise)
     return Slammed(line_map, state.trajectory(), state.cov_trajectory(cov_keyframes), state)
+
+
+def poses_for_map(trajectory: Float[np.ndarray, "T 3"], dtype: Any) -> Pose:
+    """The poses of a trajectory as a map is to be made from: as uncertain as they are against their neighbours.
+
+    What the whole of it is uncertain by, and the map with it, comes from `Slam.adjust`.
+
+    Args:
+      trajectory: poses of the scanner. m, m, rad.
+      dtype: of the scans.
+
+    Returns:
+      The poses, stacked.
+    """
+    cov = np.tile(np.diag(np.square(SIGMA_NEXT)), (len(trajectory), 1, 1))
+    return Pose(mean=jnp.asarray(trajectory, dtype), cov=jnp.asarray(cov, dtype))
 
 
 def _part(scans: Scan, begin: int) -> Scan:

@@ -34,7 +34,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 CORES = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [0]
 ALL_CORES = "--all-cores"
@@ -102,11 +102,12 @@ def main() -> int:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         rows = list(measure(options.quick, Cpp.compiled(Path(folder))))
     table = as_table(rows)
-    print(table)
+    print(as_summary(rows), table, sep="\n\n")
     if options.json:
         options.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
     if options.write:
-        write_part("speed", table)
+        whole = f"<details><summary>All rows</summary>\n\n{table}\n\n</details>"
+        write_part("speed", f"{as_summary(rows)}\n\n{whole}")
     return 0
 
 
@@ -391,6 +392,37 @@ def filled(found: Extraction, count: int) -> LineMap:
         return taken.replace(**{place: (getattr(taken, place) + away).astype(getattr(taken, place).dtype)})
 
     return LineMap(lines=slots(found.lines, "anchor"), circles=slots(found.circles, "center"))
+
+
+class Aim(NamedTuple):
+    """What some rows are meant to reach: a multiple of the C++ extractor's time."""
+
+    what: str
+    name: str
+    rows: dict[str, Any]
+    times: dict[str, float]  # by dtype
+
+
+AIMS = (
+    Aim("a scan alone", "extract", {"batch": 1, "devices": 1, "scans": "real"}, {"float32": 9, "float64": 14}),
+    Aim("a scan of a batch, one core", "extract", {"batch": 4096, "devices": 1, "scans": "real"}, {"float32": 2}),
+    Aim("a scan of a batch, two cores", "extract", {"batch": 4096, "devices": 2, "scans": "real"}, {"float32": 1.1}),
+    Aim("a scan's lines into a map of 100 + 100", "map_step", {"capacity": 128}, {"float32": 17}),
+    Aim("a scan to the map", "scan_to_map", {"scans": "real"}, {"float32": 25}),
+)
+
+
+def as_summary(rows: list[Row]) -> str:
+    """The rows for which there are aims, as Markdown."""
+    lines = ["|  | preset | dtype | us | times C++ | aim |", "| --- | --- | --- | ---: | ---: | ---: |"]
+    for aim in AIMS:
+        for row in rows:
+            meant = row["name"] == aim.name and all(row[key] == value for key, value in aim.rows.items())
+            if meant and row["dtype"] in aim.times and row["ratio_to_cpp"] is not None:
+                cells = [aim.what, row["preset"], row["dtype"], f"{row['us_per_scan']:.0f}"]
+                cells += [f"{row['ratio_to_cpp']:.1f}", f"{aim.times[row['dtype']]:g}"]
+                lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
 
 
 def as_table(rows: list[Row]) -> str:

@@ -43,7 +43,10 @@ def test_the_python_runs_as_a_user_would_run_it(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     said = re.match(r"\[(\S+)\] \[(\S+)\]\n1 \[\[", done.stdout)
-    assert done.stdout.endswith("seen 10 times, at x = 4.0 m\n")
+    assert "\nseen 10 times, at x = 4.0 m\n" in done.stdout
+    mean = re.search(r"mean NEES ([0-9.]+), where 2 is right; 9[3-7]% inside 95 %\n", done.stdout)
+    assert mean is not None, done.stdout
+    assert 1.7 < float(mean[1]) < 2.3
     assert said is not None, done.stdout
     assert [float(number) for number in said.groups()] == pytest.approx([4, 0], abs=0.01)
     assert (tmp_path / "map.json").stat().st_size > 10_000

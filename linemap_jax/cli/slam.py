@@ -133,9 +133,9 @@ def _at_poses(
 ) -> Iterator[tuple["Scan", "Pose"]]:
     """The scans of the log, as far as the trajectory goes, at its poses."""
     import jax
-    import jax.numpy as jnp
 
     from linemap_jax.build import CHUNK
+    from linemap_jax.slam import poses_for_map
 
     begin = 0
     for chunk in chunks_of_log(dataclasses.replace(command, every=command.every * every), log, CHUNK):
@@ -143,8 +143,8 @@ def _at_poses(
         begin += len(poses)
         if not len(poses):
             return
-        scans, cov = jax.tree.map(partial(_first, len(poses)), (chunk.scans, chunk.poses.cov))
-        yield scans, dataclasses.replace(chunk.poses, mean=jnp.asarray(poses, scans.ranges.dtype), cov=cov)
+        scans = jax.tree.map(partial(_first, len(poses)), chunk.scans)
+        yield scans, poses_for_map(poses, scans.ranges.dtype)
 
 
 def _first(count: int, x: Any) -> Any:

@@ -8,7 +8,7 @@ Floats = NDArray[np.float64]
 
 
 def compose(pose: ArrayLike, step: ArrayLike) -> Float[np.ndarray, "*s 3"]:
-    """The pose that is reached from a pose by a step seen from there, both x, y, theta. m, m, rad."""
+    """The pose that is reached from a pose by a step seen from there, both x, y, theta. m, m, rad in (-pi, pi]."""
     pose, step = np.asarray(pose, float), np.asarray(step, float)
     place = pose[..., :2] + _turned(pose[..., 2], step)
     return np.concatenate([place, _wrapped(pose[..., 2:] + step[..., 2:])], -1)
@@ -27,4 +27,4 @@ def _turned(angle: ArrayLike, step: Floats) -> Floats:
 
 
 def _wrapped(angle: Floats) -> Floats:
-    return (angle + np.pi) % (2 * np.pi) - np.pi
+    return angle - 2 * np.pi * np.ceil((angle - np.pi) / (2 * np.pi))

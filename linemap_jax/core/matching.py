@@ -38,7 +38,8 @@ class LineComparison:
 def compare_lines(new: Lines, model: Lines, thresholds: Thresholds, pose_error: PoseError) -> LineComparison:
     """Hold one new line against one line of the map: section 5.1.1.
 
-    The gates on angle and end points widen with the predicted spread of what they gate; the paper's are fixed.
+    The gates on angle and end points widen with the predicted spread of what they gate; the paper's are fixed. Without
+    any noise there is no statistical distance: it counts as zero, and those gates decide alone.
 
     Args:
       new: the new line, no batch axis.
@@ -71,7 +72,7 @@ def compare_lines(new: Lines, model: Lines, thresholds: Thresholds, pose_error: 
         var_offset = var_offset + jnp.sum(by_offset**2)
     det = var_offset * var_angle - covariance**2
     weighted = var_angle * offset**2 - 2 * covariance * offset * turn + var_offset * turn**2
-    nis = weighted / jnp.where(det > 0, det, 1)
+    nis = jnp.where(det > 0, weighted / jnp.where(det > 0, det, 1), 0)
 
     # Gates are compared as squares; that saves the square roots.
     near = turn**2 < jnp.maximum(thresholds.match_angle**2, thresholds.match_sigmas**2 * var_angle)

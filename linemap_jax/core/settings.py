@@ -105,7 +105,7 @@ class Persistence:
     """
 
     share: Number = 1.0
-    """The part of the pose's covariance that persists, from 0 to 1."""
+    """The part of the pose's covariance that persists, from 0 to 1. Its root is kept: at 0 it has no derivative."""
     correlation: Number = 0.99
     """Of what persists, from one scan to the next, from 0 to 1. The error persists over 1 / (1 - correlation) scans."""
 

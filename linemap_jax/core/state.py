@@ -53,6 +53,8 @@ class Status(enum.IntFlag):
     """The map had no free slot for a line."""
     MAP_CIRCLES_FULL = 8
     """The map had no free slot for a circle."""
+    MAP_FULL = MAP_LINES_FULL | MAP_CIRCLES_FULL
+    """Either; `grow` makes room."""
     POSE_NOT_FINITE = 16
     """The pose or its covariance held NaN or infinity; the scan was left out. Of odometry: the step was."""
     LOST = 32

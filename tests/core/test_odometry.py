@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from linemap_jax.core import frames_on_host
 from linemap_jax.core.estimation.odometry import (
     GyroscopeNoise,
     Increment,
@@ -132,3 +133,13 @@ def test_float32_stays_float32_and_batches() -> None:
     assert single.mean.dtype == single.cov.dtype == jnp.float32
     double: Increment = many(jnp.asarray(steps))
     np.testing.assert_allclose(single.cov, double.cov, atol=1e-8)
+
+
+@pytest.mark.parametrize("turn", [0.0, 1.0, np.pi, -np.pi, 3 * np.pi, 4.0])
+def test_poses_on_the_host_are_those_of_jax(turn: float) -> None:
+    pose, step = np.array([1.0, -2.0, 0.0]), np.array([0.5, 0.25, turn])
+    after = compose(jnp.asarray(pose), jnp.asarray(step))
+    np.testing.assert_allclose(frames_on_host.compose(pose, step), after, rtol=1e-15)
+    np.testing.assert_allclose(
+        frames_on_host.between(pose, pose + step), between(jnp.asarray(pose), jnp.asarray(pose + step)), rtol=1e-15
+    )

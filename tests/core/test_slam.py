@@ -1,5 +1,6 @@
 """Surfaces, registration, loops, the pose graph and the adjustment: against NumPy, and in rooms that are known."""
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -12,7 +13,9 @@ from linemap_jax.core.estimation.loops import LoopSettings, close_loop
 from linemap_jax.core.estimation.pose_graph import Closures, PoseGraph, cov_of_registration, optimise
 from linemap_jax.core.estimation.registration import nearest, register
 from linemap_jax.core.estimation.surface import Surface, seen_from, surface_of_scan
-from linemap_jax.core.state import Scan, empty_lines
+from linemap_jax.core.state import Lines, Scan, empty_lines
+
+adjusted, optimised = jax.jit(adjust), jax.jit(optimise)
 
 BEARINGS = np.deg2rad(np.arange(180) - 89.5)
 ROOM = np.array([[-4.0, -3.0], [5.0, -3.0], [5.0, 1.0], [3.0, 1.0], [3.0, 3.0], [-4.0, 3.0]])
@@ -192,7 +195,7 @@ def numpy_optimum(graph: PoseGraph, count: int, closures: int) -> np.ndarray:
 def test_the_graph_settles_where_dense_least_squares_does() -> None:
     """The wrong closure loses its weight, and the true ones keep nearly all of theirs."""
     truth, graph = square_drive(np.random.default_rng(4))
-    done = jax.jit(optimise)(graph)
+    done = optimised(graph)
     weight = np.asarray(done.closures.weight)
     assert weight[10] < 1e-3
     assert (weight[:10] > 0.2).all()
@@ -220,44 +223,70 @@ def test_a_doubtful_registration_says_little() -> None:
     np.testing.assert_allclose(np.diag(none), [1, 1, 1], rtol=1e-3)
 
 
+WALLS = [(np.array([8.0, 2.0]), 0.02), (np.array([2.0, 9.0]), 1.55), (np.array([-3.0, 2.0]), 3.1)]
+SIGMA_OF_WALL = np.array([0.005, 0.002])
+
+
+def sightings_from(poses: np.ndarray, random: np.random.Generator) -> tuple[Lines, LineSightings]:
+    """Three walls, each seen with noise from each of the poses; and room for two more sightings."""
+    lines = empty_lines(4, "float64")
+    lines = dataclasses.replace(
+        lines,
+        anchor=lines.anchor.at[:3].set(jnp.asarray([point for point, _ in WALLS])),
+        angle=lines.angle.at[:3].set(jnp.asarray([angle for _, angle in WALLS])),
+        valid=lines.valid.at[:3].set(True),
+    )
+    anchors, angles = [], []
+    for pose in poses:
+        for point, angle in WALLS:
+            offset, turn = random.normal(0, SIGMA_OF_WALL)
+            normal = np.array([np.cos(angle - pose[2]), np.sin(angle - pose[2])])
+            anchors.append(between(pose, [*point, 0.0])[:2] + offset * normal)
+            angles.append(angle - pose[2] + turn)
+    n = len(poses)
+    sightings = LineSightings(
+        keyframe=jnp.asarray([*np.repeat(np.arange(n), 3), 0, 0]),
+        line=jnp.asarray([*np.tile(np.arange(3), n), 3, 3]),
+        anchor=jnp.asarray([*anchors, np.zeros(2), np.zeros(2)]),
+        angle=jnp.asarray([*angles, 0.0, 0.0]),
+        cov=jnp.asarray([np.diag(SIGMA_OF_WALL**2)] * (3 * n) + [np.eye(2)] * 2),
+        valid=jnp.arange(3 * n + 2) < 3 * n,
+    )
+    return lines, sightings
+
+
+@pytest.mark.parametrize("walls", [1, 2, 3])
+def test_sightings_that_err_as_they_say_have_unit_variance(walls: int) -> None:
+    """However few they are: what they do not determine of the poses, the steps do."""
+    found = []
+    for seed in range(8):
+        random = np.random.default_rng(seed)
+        truth, graph = square_drive(random)
+        lines, sightings = sightings_from(truth, random)
+        sightings = dataclasses.replace(sightings, valid=sightings.valid & (sightings.line < walls))
+        found.append(adjusted(optimised(graph), lines, sightings).unit_variance)
+    # About 40 redundant ones of one wall in each drive, 120 of two, 200 of three
+    assert np.mean(found) == pytest.approx(1, abs=3 * np.sqrt(2 / (8 * (40, 120, 200)[walls - 1])))
+
+
 def test_poses_and_lines_adjusted_together() -> None:
     """Against dense least squares in NumPy, estimates and covariances; a sighting of another line is left out."""
     random = np.random.default_rng(5)
     _, graph = square_drive(random)
-    graph = jax.jit(optimise)(graph)
+    graph = optimised(graph)
     count, poses = 40, np.asarray(graph.poses)
-    walls = [(np.array([8.0, 2.0]), 0.02), (np.array([2.0, 9.0]), 1.55), (np.array([-3.0, 2.0]), 3.1)]
-    seen = []
-    for k in range(count):
-        for slot, (point, angle) in enumerate(walls):
-            anchor = between(poses[k], [*point, 0.0])[:2]
-            seen.append((k, slot, anchor, angle - poses[k, 2]))
-    sigma = np.array([0.005, 0.002])
-    noisy = [
-        (k, slot, at + random.normal(0, sigma[0]) * np.array([np.cos(a), np.sin(a)]), a + random.normal(0, sigma[1]))
-        for k, slot, at, a in seen
-    ]
-    noisy.append((7, 1, noisy[0][2], noisy[0][3]))  # of another wall
-    lines = empty_lines(4, "float64")
-    lines = jax.tree.map(jnp.asarray, lines)
-    lines.anchor.at[:3]  # noqa: B018
-    lines = type(lines)(
-        **{
-            **{name: getattr(lines, name) for name in lines.__dataclass_fields__},
-            "anchor": lines.anchor.at[:3].set(jnp.asarray([point for point, _ in walls])),
-            "angle": lines.angle.at[:3].set(jnp.asarray([angle for _, angle in walls])),
-            "valid": lines.valid.at[:3].set(True),
-        }
+    lines, sightings = sightings_from(poses[:count], random)
+    # One more, of another wall
+    sightings = dataclasses.replace(
+        sightings,
+        keyframe=sightings.keyframe.at[-2].set(7),
+        line=sightings.line.at[-2].set(1),
+        anchor=sightings.anchor.at[-2].set(sightings.anchor[0]),
+        angle=sightings.angle.at[-2].set(sightings.angle[0]),
+        cov=sightings.cov.at[-2].set(sightings.cov[0]),
+        valid=sightings.valid.at[-2].set(True),
     )
-    sightings = LineSightings(
-        keyframe=jnp.asarray([s[0] for s in noisy] + [0]),
-        line=jnp.asarray([s[1] for s in noisy] + [3]),
-        anchor=jnp.asarray([s[2] for s in noisy] + [np.zeros(2)]),
-        angle=jnp.asarray([s[3] for s in noisy] + [0.0]),
-        cov=jnp.asarray([np.diag(sigma**2)] * len(noisy) + [np.eye(2)]),
-        valid=jnp.asarray([True] * len(noisy) + [False]),
-    )
-    done = jax.jit(adjust)(graph, lines, sightings)
+    done = adjusted(graph, lines, sightings)
     assert done.seen.tolist() == [True, True, True, False]
     assert 0.8 < done.unit_variance < 1.2
 
@@ -265,7 +294,9 @@ def test_poses_and_lines_adjusted_together() -> None:
     c = jax.tree.map(np.asarray, graph.closures)
     steps = [(i - 1, i, np.asarray(graph.step[i]), np.asarray(graph.cov_step[i])) for i in range(1, count)]
     steps += [(c.begin[k], c.end[k], c.step[k], c.cov[k] / max(weight[k], 1e-12)) for k in range(11)]
-    residual = jax.jit(residual_of_sighting)
+    residual = jax.jit(jax.vmap(residual_of_sighting))
+    seen = jax.tree.map(lambda x: np.asarray(x)[: 3 * count], sightings)
+    places = np.array([point for point, _ in WALLS])
 
     def residuals(flat: np.ndarray) -> np.ndarray:
         at = np.concatenate([poses[:1], flat[: 3 * (count - 1)].reshape(-1, 3)])
@@ -275,11 +306,10 @@ def test_poses_and_lines_adjusted_together() -> None:
             e = between(at[i], at[j]) - step
             e[2] = np.arctan2(np.sin(e[2]), np.cos(e[2]))
             off.append(np.linalg.solve(np.linalg.cholesky(cov), e))
-        for k, slot, anchor, angle in noisy[:-1]:
-            off.append(np.asarray(residual(at[k], state[slot], walls[slot][0], anchor, angle)) / sigma)
-        return np.concatenate(off)
+        e = residual(at[seen.keyframe], state[seen.line], places[seen.line], seen.anchor, seen.angle)
+        return np.concatenate([*off, np.ravel(np.asarray(e) / SIGMA_OF_WALL)])
 
-    flat = np.concatenate([poses[1:count].ravel(), np.ravel([[0.0, angle] for _, angle in walls])])
+    flat = np.concatenate([poses[1:count].ravel(), np.ravel([[0.0, angle] for _, angle in WALLS])])
     for _ in range(2):
         r = residuals(flat)
         jac = np.stack([(residuals(flat + h) - r) / 1e-7 for h in 1e-7 * np.eye(flat.size)], -1)

@@ -113,7 +113,8 @@ def adjust(graph: PoseGraph, lines: Lines, sightings: LineSightings) -> Adjusted
     The lines are eliminated; what is left is dense, of order 3 N, and time grows with its cube. Sightings that do not
     fit are left out; the closures keep the weights that they have in the graph. Where the sightings that are left fit
     less well than their covariances have it, all covariances are as much larger (the variance of unit weight a
-    posteriori, of adjustment computation). In float64.
+    posteriori, of adjustment computation). Their residuals are held against their redundancy: their number, less the
+    part of the unknowns that they determine; steps and closures determine the rest. In float64.
 
     Args:
       graph: keyframes, optimised. The first one is held.
@@ -156,20 +157,22 @@ def adjust(graph: PoseGraph, lines: Lines, sightings: LineSightings) -> Adjusted
         weight = (sightings.valid & (square < widening * GATE)).astype(poses.dtype)
         of_pose, of_line = (weight[:, None, None] * jac for jac in (by_pose, by_line))
         seen = jnp.zeros(k, bool).at[sightings.line].max(weight > 0)
-        redundancy = 2 * jnp.sum(weight) - 3 * jnp.sum(linked) - 2 * jnp.sum(seen)
 
         place, slot = _places(sightings.keyframe, 3), sightings.line
+        of_steps_alone = of_poses
         of_poses = of_poses.at[place[:, :, None], place[:, None]].add(_mt(of_pose) @ by_pose)
         held = jnp.repeat((jnp.arange(n) == 0) | ~graph.valid, 3)
         unseen = jnp.where(seen[:, None, None], 0, _HELD * jnp.eye(2, dtype=poses.dtype)[None])
         return _System(
+            of_steps=jnp.where(held[:, None] | held[None], 0, of_steps_alone),
             of_poses=of_poses + jnp.diag(jnp.where(held, _HELD, 0)),
             of_lines=unseen + jnp.zeros((k, 2, 2), poses.dtype).at[slot].add(_mt(of_line) @ by_line),
             of_both=jnp.zeros((3 * n, k, 2), poses.dtype).at[place, slot[:, None]].add(_mt(of_pose) @ by_line),
             pull_poses=pull_poses.at[place].add(-_mtv(of_pose, off)),
             pull_lines=jnp.zeros((k, 2), poses.dtype).at[slot].add(-_mtv(of_line, off)),
             seen=seen,
-            unit_variance=jnp.sum(weight * square) / jnp.maximum(redundancy, 1),
+            misfit=jnp.sum(weight * square),
+            count=2 * jnp.sum(weight),
         )
 
     def iterate(at: tuple[Array, Array], widening: Array) -> tuple[tuple[Array, Array], None]:
@@ -184,8 +187,12 @@ def adjust(graph: PoseGraph, lines: Lines, sightings: LineSightings) -> Adjusted
     (poses, state), _ = jax.lax.scan(iterate, begin_at, jnp.asarray(WIDENING, graph.poses.dtype))
     now = system(poses, state, 1.0)
     factor, through = _eliminated(now)
-    scale = jnp.maximum(now.unit_variance, 1)
-    cov = scale * cho_solve(factor, jnp.eye(3 * n, dtype=poses.dtype))
+    cov = cho_solve(factor, jnp.eye(3 * n, dtype=poses.dtype))
+    unknowns = 3 * jnp.sum(linked) + 2 * jnp.sum(now.seen)
+    redundancy = now.count - unknowns + jnp.sum(cov * now.of_steps)
+    unit_variance = now.misfit / jnp.maximum(redundancy, 1)
+    scale = jnp.maximum(unit_variance, 1)
+    cov = scale * cov
     cov_poses = jnp.moveaxis(jnp.diagonal(cov.reshape(n, 3, n, 3), axis1=0, axis2=2), -1, 0)
     spread = (cov @ through.reshape(3 * n, 2 * k)).reshape(3 * n, k, 2)
     cov_lines = scale * inverse(now.of_lines) + jnp.einsum("pki,pkj->kij", through, spread)
@@ -197,7 +204,7 @@ def adjust(graph: PoseGraph, lines: Lines, sightings: LineSightings) -> Adjusted
         cov_independent=jnp.where(seen[:, None, None], symmetric(cov_lines), lines.cov_independent),
         sqrt_persistent=jnp.where(seen[:, None, None], 0, lines.sqrt_persistent),
     )
-    return Adjusted(poses, symmetric(cov_poses), moved, seen, now.unit_variance)
+    return Adjusted(poses, symmetric(cov_poses), moved, seen, unit_variance)
 
 
 def with_error_of_poses(
@@ -243,13 +250,15 @@ def with_error_of_poses(
 class _System(NamedTuple):
     """Normal equations, in blocks: poses, lines, and what couples them."""
 
-    of_poses: Float[Array, "P P"]  # P = 3 N
+    of_steps: Float[Array, "P P"]  # P = 3 N; of steps and closures alone, zero for what is held
+    of_poses: Float[Array, "P P"]
     of_lines: Float[Array, "K 2 2"]
     of_both: Float[Array, "P K 2"]
     pull_poses: Float[Array, " P"]
     pull_lines: Float[Array, "K 2"]
     seen: Bool[Array, " K"]
-    unit_variance: Float[Array, ""]
+    misfit: Float[Array, ""]  # chi-square of the sightings
+    count: Float[Array, ""]  # of their residuals
 
 
 def _eliminated(system: _System) -> tuple[Any, Float[Array, "P K 2"]]:

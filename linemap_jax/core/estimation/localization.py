@@ -34,7 +34,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from linemap_jax.core.estimation.likelihood_field import Counts, LikelihoodField, distances, search, thinned
 from linemap_jax.core.estimation.odometry import OdometryNoise, cov_step
-from linemap_jax.core.extract import extract
+from linemap_jax.core.extract import extract, usable
 from linemap_jax.core.frames import (
     compose,
     dot,
@@ -280,7 +280,7 @@ def observe(
 ) -> Seen:
     """Lines, circles and points of a scan in the frame of the robot, whatever its pose."""
     dtype = scan.ranges.dtype
-    here = Pose(mean=jnp.zeros(3, dtype), cov=jnp.zeros((3, 3), dtype))
+    scan, here, _ = usable(scan, Pose(mean=jnp.zeros(3, dtype), cov=jnp.zeros((3, 3), dtype)))
     found = extract(
         scan,
         here,

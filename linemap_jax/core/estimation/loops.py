@@ -44,7 +44,9 @@ class LoopSettings:
     least_drift: Number = 0.05
     """The same where the path has no length, m."""
     turn_drift_per_metre: Number = 0.005
-    """The same for the direction, rad / m."""
+    """How uncertain its direction is, for each metre, rad / m."""
+    least_turn_drift: Number = 0.05
+    """The same where the path has no length, rad."""
     search_from: Number = 0.3
     """Uncertainty from which the pose is searched for, m."""
     share_near: Number = 0.6
@@ -107,7 +109,7 @@ def close_loop(
     """
     surface = joined(surfaces, poses, valid)
     drift = settings.least_drift + settings.drift_per_metre * path
-    turn_drift = settings.least_drift + settings.turn_drift_per_metre * path
+    turn_drift = settings.least_turn_drift + settings.turn_drift_per_metre * path
 
     def near(_: None) -> Closure:
         prior = jnp.diag(jnp.asarray([0.04, 0.04, 1.0], guess.dtype))  # nearly nothing: the points are to say it
