@@ -642,11 +642,14 @@ def test_a_bag_gives_the_map_of_the_carmen_log(run, log, tmp_path):
     maps, said = [], []
     for name, path in (("carmen", log), ("ros", bag)):
         status, out, err = run("build", path, "-o", tmp_path / name)
-        assert (status, err) == (0, "")
-        said.append(out)
+        assert status == 0
+        said.append((out, err))
         maps.append(json.loads((tmp_path / name / "map.json").read_text())["lines"])
-    assert "poses:   of the laser, as the log states them; noise: --pose-sigma 0.05 0.05 0.01\n" in said[0]
-    assert "poses:   nav_msgs/Odometry on /odom; noise: as the log states it; laser on the robot: tf, laser" in said[1]
+    assert "poses:   of the laser, as the log states them; noise: --pose-sigma 0.05 0.05 0.01\n" in said[0][0]
+    assert "poses:   nav_msgs/Odometry on /odom; noise: as the log states it; laser on the robot: tf," in said[1][0]
+    assert said[0][1] == ""
+    drifts = f"{bag}: its poses are raw odometry (nav_msgs/Odometry on /odom), which drifts"
+    assert said[1][1] == f"linemap: warning: {drifts}; `linemap slam` corrects it, `build` does not\n"
     assert len(maps[0]) == len(maps[1]) >= 3
     for a, b in zip(*maps, strict=True):  # bearings of a bag have seven digits
         np.testing.assert_allclose([a["rho"], a["theta"]], [b["rho"], b["theta"]], atol=1e-4)
@@ -677,7 +680,9 @@ def test_info_of_a_carmen_log(run, log):
     assert told["shares"]["returns"] > 0.99
     assert sum(told["shares"].values()) == pytest.approx(1)
     words = f"{log}: CARMEN log\n        10 FLASER\nscans:    10 in 9.0 s, 1.0 a second\n"
-    assert run("info", log)[1].startswith(words)
+    said = run("info", log)[1]
+    assert said.startswith(words)
+    assert said.endswith(f"\nnext:     linemap build {log} -o my-map (or `slam`, if nobody has corrected the poses)\n")
 
 
 def test_info_of_a_bag(run, tmp_path):
@@ -705,8 +710,13 @@ def test_info_of_a_bag_with_two_scanners_tells_of_both(run, tmp_path):
     assert status == 0
     assert "would refuse it: it holds the scans of several scanners, choose one by --scan-topic: /rear (1)," in out
     assert "with --scan-topic /rear:\n  frames:   laser in base_link (static)\n  scans:    1 in 0.0 s\n" in out
+    assert "  laser on the robot: tf, laser in base_link; x 0.000 m, y 0.000 m, yaw 17.2 degrees\n" in out
+    assert (
+        f"  next:     linemap slam {bag} -o my-map --scan-topic /rear (the poses are odometry's, which drifts)\n" in out
+    )
     told = json.loads(run("info", bag, "--json")[1])
     assert {topic: of["scans"] for topic, of in told["scanners"].items()} == {"/rear": 1, "/scan": 3}
+    assert told["scanners"]["/scan"]["mount_m_rad"] == pytest.approx([0, 0, 0.3])
     assert json.loads(run("info", bag, "--json", "--scan-topic", "/rear")[1])["beams"] == 5
 
 
@@ -720,3 +730,26 @@ def test_info_of_a_bag_without_scans_tells_the_rest(run, refuse, tmp_path):
     assert "it holds no sensor_msgs/LaserScan" in out
     bag.write_bytes(bag.read_bytes()[:300])
     assert "is cut off or damaged" in refuse("info", bag)
+
+
+# --- Slips of the pen ------------------------------------------------------------------------------------------------
+
+
+def test_a_command_that_there_is_not(run):
+    assert run("localise", "a", "b") == (2, "", "linemap: there is no command 'localise'; did you mean localize?\n")
+    assert run("xyz")[2].startswith("linemap: there is no command 'xyz'; there are demo, build, slam, ")
+
+
+@pytest.mark.parametrize(
+    ("option", "told"),
+    [
+        (["--range-sigma", "0.02m"], "--range-sigma: '0.02m' is not a number"),
+        (["--pose-sigma", "1", "2", "c"], "--pose-sigma: 'c' is not a number"),
+        (["--every", "2.5"], "--every: '2.5' is not a whole number"),
+    ],
+)
+def test_what_is_no_number_is_told_in_plain_words(option, told, capsys):
+    with pytest.raises(SystemExit) as caught:
+        main(["build", "my.log", "-o", "out", *option])
+    assert caught.value.code == 2
+    assert told in capsys.readouterr().err

@@ -121,6 +121,7 @@ def test_what_is_refused(room: dict[str, Any], tmp_path: Path, capsys: Any) -> N
         ([here, log, "-o", str(tmp_path / "a.tum"), "--odometry-noise", "0"], "--odometry-noise must be positive"),
         ([here, log, "-o", str(tmp_path / "there.tum")], "exists already"),
         ([log, log, "-o", str(tmp_path / "a.tum")], "drive.log"),
+        ([log, here, "-o", str(tmp_path / "a.tum")], "the map comes first, then the log"),
     ):
         assert main(["localize", *args]) == 2
         assert told in capsys.readouterr().err

@@ -1,5 +1,6 @@
 """`linemap slam` on a simulated drive around a block, from what the wheels have counted."""
 
+import dataclasses
 import json
 import math
 from collections.abc import Callable
@@ -12,10 +13,13 @@ import numpy as np
 import pytest
 
 from linemap_jax.cli import main
+from linemap_jax.cli.evaluate import Evaluate
+from linemap_jax.cli.fit import at_poses_of_map
+from linemap_jax.cli.options import UsageError
 from linemap_jax.core.frames import compose
 from linemap_jax.io.carmen_writer import write_carmen
 from linemap_jax.io.map_file import read_map
-from linemap_jax.io.tum import read_tum
+from linemap_jax.io.tum import read_tum, write_tum
 from linemap_jax.lab.generators import ring
 from linemap_jax.lab.scanners import pls
 from linemap_jax.lab.simulate import simulate
@@ -91,6 +95,10 @@ def test_a_drive_around_a_block(drive: Drive, run: Callable[..., Any], tmp_path:
     assert np.abs(np.angle(np.exp(1j * off[:, 2]))).max() < 0.02
     assert told["loops"] > 20
     assert told["explained"] > 0.9
+    assert told["times_real_time"] == pytest.approx(0.25e6 * (SCANS - 1) / SCANS / told["us_per_scan"])
+    assert told["us_per_scan"] > 0
+    lost = np.loadtxt(tmp_path / "out" / "trajectory.csv", delimiter=",", skiprows=1)[:, -1]
+    assert lost[0] == 0  # before it there is nothing to agree with
 
     line_map, settings = read_map(tmp_path / "out" / "map.json", dtype="float32")
     lines = jax.tree.map(np.asarray, line_map.lines)
@@ -99,6 +107,31 @@ def test_a_drive_around_a_block(drive: Drive, run: Callable[..., Any], tmp_path:
     longest = np.flatnonzero(outer)[np.argmax(np.asarray(line_map.lines.length)[outer])]
     y = np.asarray(line_map.lines.begin)[longest, 1]
     assert abs(y + 7.0) < 4 * math.sqrt(np.asarray(line_map.lines.cov)[longest, 0, 0]) + 0.01
+
+
+def test_the_log_of_a_map_is_read_at_the_poses_that_slam_found(tmp_path: Path, capsys: Any) -> None:
+    settings = {"log": "drive.log", "slam": {"laser_offset": [0.2, 0.0, 0.1]}}
+    trajectory, log = tmp_path / "trajectory.tum", tmp_path / "elsewhere" / "drive.log"
+    command = Evaluate(map=tmp_path, log=log)
+
+    def at(command: Evaluate, log: Path = log, settings: Any = settings) -> Evaluate:
+        return at_poses_of_map(command, log, command.map, settings, quiet=False)
+
+    with pytest.raises(UsageError, match=r"built by `linemap slam`, so not at the poses of .*: give its trajectory by"):
+        at(command)
+    write_tum(trajectory, [0.0], np.zeros((1, 3)))
+    assert at(command) == dataclasses.replace(command, poses=trajectory, laser_offset=(0.2, 0.0, 0.1))
+    assert capsys.readouterr().err == (
+        f"linemap: {tmp_path} was built by `linemap slam`: the poses are those of {trajectory}\n"
+    )
+    assert at(dataclasses.replace(command, map=tmp_path / "map.json")).poses == trajectory
+    write_tum(trajectory, [0.0], np.zeros((1, 3)), pose_frame="laser", overwrite=True)
+    assert at(command).laser_offset is None
+    for other in (dataclasses.replace(command, poses=log), dataclasses.replace(command, standstill=True)):
+        assert at(other) is other  # who says where poses come from is obeyed
+    assert at(command, log=Path("other.log")) is command
+    assert at(command, settings={"log": "drive.log"}) is command
+    assert at(command, settings=settings | {"slam": {"laser_offset": ["x"]}}).poses == trajectory
 
 
 @pytest.mark.parametrize("name", ["map.json", "map.png", "trajectory.tum"])
@@ -118,9 +151,9 @@ def test_a_robot_that_is_carried_away(drive: Drive, run: Callable[..., Any], tmp
     drive.odometry = drive.odometry - (drive.odometry[250] - drive.odometry[40]) * (np.arange(SCANS) >= 250)[:, None]
     drive.write(tmp_path / "carried.log", kept, stamps)  # pyright: ignore[reportArgumentType]
     drive.odometry = odometry
-    options = ("--trajectory-frame", "base", "--laser-offset", 0.2, 0, 0)
-    status, _, err = run("slam", tmp_path / "carried.log", "-o", tmp_path / "out", *options)
+    status, _, err = run("slam", tmp_path / "carried.log", "-o", tmp_path / "out", "--laser-offset", 0.2, 0, 0)
     assert status == 0
+    assert (tmp_path / "out" / "trajectory.tum").read_text().startswith("# poses of the robot: ")
     assert "1 scan came more than 60 s after" in err
     assert "few points agree with what was seen before" in err
     poses = read_tum(tmp_path / "out" / "trajectory.tum").poses

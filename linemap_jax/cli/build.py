@@ -25,6 +25,10 @@ if TYPE_CHECKING:
 DEMO_NOISE = {"range_sigma": 0.015, "bearing_sigma": 0.0005, "pose_sigma": (0.01, 0.01, 0.002)}
 """What the demo log was made with."""
 
+FEW_EXPLAINED = 0.6
+"""Share of the returns that lie on a map, below which something is wrong: of maps of corrected logs two thirds and more
+do."""
+
 COUNTS = ("added", "fused", "merged", "trimmed", "split", "deleted")
 """The counts of a `Report`."""
 
@@ -62,6 +66,12 @@ class Build(LogOptions):
         before = map_to_resume(self.resume_from, self.dtype) if self.resume_from else None
         log = opened(self, self.log)
         options["mount"] = mount_of(self, log, quiet=self.quiet)
+        if log.notes.drift:
+            say(
+                f"warning: {log.path}: its poses are raw odometry ({log.notes.poses}), which drifts; `linemap slam` "
+                "corrects it, `build` does not",
+                quiet=self.quiet,
+            )
         settings = {
             "log": self.log.name,
             "preset": self.preset,
@@ -105,6 +115,14 @@ class Build(LogOptions):
         files = {"map": str(map_file), "picture": str(picture)} | ({"page": str(page)} if self.html else {})
         summary = _summary(self, line_map, report, options, seconds) | {"poses": tell_poses(self, log)} | files
         print(json.dumps(summary, indent=2) if self.json else _in_words(summary))
+        share = float(summary["explained"])
+        if summary["lines"] and share < FEW_EXPLAINED:
+            say(
+                f"warning: {log.path}: only {share:.0%} of its returns lie on the map: do its poses "
+                "drift (`linemap slam` corrects them), does the laser sit elsewhere (--laser-offset), or is the noise "
+                "larger (--range-sigma, --pose-sigma)?",
+                quiet=self.quiet,
+            )
         return 0
 
 

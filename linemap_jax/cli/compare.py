@@ -8,13 +8,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from linemap_jax.cli.fit import Fit, at_poses_of_map
 from linemap_jax.cli.logs import mount_of, opened, plain_chunks, progress, warn
-from linemap_jax.cli.merge import read_two_maps
+from linemap_jax.cli.merge import read_two_maps, warn_of_frames
 from linemap_jax.cli.options import LogInput, UsageError, check_input
 
 if TYPE_CHECKING:
-    from linemap_jax.lab.comparison import Change, Comparison, What
+    from linemap_jax.lab.comparison import Agreement, Change, Comparison, What
 
+ASK: "dict[What, str]" = {
+    "vanished": "--log-b tells what is gone from what the second drive did not look at",
+    "appeared": "--log-a tells what is new from what the first drive did not look at",
+}
+"""What to do about changes that no log bears out."""
 MOST_TOLD = 15
 """Changes of a kind that are told in words; --json tells all."""
 
@@ -34,7 +40,7 @@ class Compare(LogInput):
     within: Annotated[float, tyro.conf.arg(metavar="M")] = 0.5
     """How far a thing may have moved, m; farther away it is another one."""
     alpha: Annotated[float, tyro.conf.arg(metavar="P")] = 0.01
-    """Probability of telling of any movement where there is none."""
+    """Probability of telling of any movement where there is none, given which thing is held against which."""
     shortest: Annotated[float, tyro.conf.arg(metavar="M")] = 0.5
     """Shortest piece of a line that is told to have vanished or appeared, m."""
     at_least: Annotated[int, tyro.conf.arg(metavar="N")] = 3
@@ -54,31 +60,38 @@ class Compare(LogInput):
         if self.at_least < 1:
             raise UsageError(f"--at-least must be 1 or more, not {self.at_least}")
         check_input(self)
-        a, b, _ = read_two_maps(self.a, self.b)
+        a, b, settings = read_two_maps(self.a, self.b)
         from linemap_jax.build import CHUNK
-        from linemap_jax.lab.comparison import compare_maps, looked_through
+        from linemap_jax.lab.comparison import agreement, compare_maps, looked_through
 
         options = {"within": self.within, "alpha": self.alpha, "shortest": self.shortest, "at_least": self.at_least}
+        alike = agreement(a, b)
+        warn_of_frames(self.a, self.b, alike, quiet=self.quiet)
         found = compare_maps(a, b, **options)
         logs: list[tuple[What, Path | None]] = [("appeared", self.log_a), ("vanished", self.log_b)]
-        for what, path in logs:
+        for (what, path), map_file, line_map, of_map in zip(logs, (self.a, self.b), (a, b), settings, strict=True):
             if path is not None:
-                log = opened(self, path)
-                mount = mount_of(self, log, quiet=self.quiet)
+                command = at_poses_of_map(self, path, map_file, of_map, quiet=self.quiet)
+                log = opened(command, path)
+                mount = mount_of(command, log, quiet=self.quiet)
+                fit = Fit(line_map, mount)
                 with progress(log, quiet=self.quiet):
-                    changes = looked_through(found.changes, plain_chunks(log), what, mount, chunk=CHUNK)
+                    changes = looked_through(found.changes, fit.through(plain_chunks(log)), what, mount, chunk=CHUNK)
                 found = found._replace(changes=changes)
                 warn(log, quiet=self.quiet)
-        print(json.dumps(_summary(self, found), indent=2) if self.json else _in_words(found))
+                fit.warn(log, map_file, quiet=self.quiet)
+        print(json.dumps(_summary(self, found, alike), indent=2) if self.json else _in_words(found))
         return 0
 
 
-def _summary(command: Compare, found: "Comparison") -> dict[str, Any]:
+def _summary(command: Compare, found: "Comparison", alike: "Agreement") -> dict[str, Any]:
     said: dict[str, Any] = {
         "a": str(command.a),
         "b": str(command.b),
         "alpha": command.alpha,
         "pairs": found.pairs,
+        "overlap_m": alike.overlap,
+        "agreeing_m": alike.agreeing,
         "same_lines": found.same_lines,
         "same_circles": found.same_circles,
     }
@@ -104,6 +117,8 @@ def _in_words(found: "Comparison") -> str:
         said += [f"  {_told(change)}" for change in sure[:MOST_TOLD]]
         if len(sure) > MOST_TOLD:
             said.append(f"  ... and {len(sure) - MOST_TOLD} more")
+        if what in ASK and any(change.passed is None for change in changes):
+            said.append(f"  {ASK[what]}")
         if len(changes) > len(sure):
             said.append(
                 f"  {len(changes) - len(sure)} more are in one map only, but the other drive did not see through"

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from linemap_jax.cli.compilations import keep_compilations
+from linemap_jax.cli.fit import at_poses_of_map, warn_of_fit
 from linemap_jax.cli.logs import SCANS_EXPLAINED, mount_of, opened, plain_chunks, progress, warn
 from linemap_jax.cli.options import LogInput, UsageError, check_input
 from linemap_jax.cli.worlds import world_from_file
@@ -51,12 +52,13 @@ class Evaluate(LogInput):
         keep_compilations()
         from linemap_jax.io.map_file import read_map
 
-        line_map, _ = read_map(self.map, dtype="float64")
+        line_map, settings = read_map(self.map, dtype="float64")
+        command = self if self.log is None else at_poses_of_map(self, self.log, self.map, settings, quiet=self.quiet)
         scores: dict[str, Any] = {"map": str(self.map)}
         if self.world is not None:
-            scores["truth"] = _against_world(self, self.world, line_map)
+            scores["truth"] = _against_world(command, self.world, line_map)
         if self.log is not None:
-            scores["log"] = _against_log(self, self.log, line_map)
+            scores["log"] = _against_log(command, self.log, line_map)
         print(json.dumps(scores, indent=2, allow_nan=False) if self.json else _scores_in_words(scores))
         return 0
 
@@ -125,6 +127,7 @@ def _against_log(command: Evaluate, path: Path, line_map: "LineMap") -> dict[str
     warn(log, quiet=command.quiet)
     with progress(log, quiet=command.quiet):
         score = evaluate_log(line_map, plain_chunks(log, every=-(-scans // SCANS_EXPLAINED)), mount, chunk=CHUNK)
+    warn_of_fit(score.explained, path, command.map, quiet=command.quiet)
     return {
         "log": str(path),
         "scans": scans,

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from linemap_jax.cli.compilations import keep_compilations
+from linemap_jax.cli.fit import Fit, at_poses_of_map
 from linemap_jax.cli.logs import mount_of, opened, progress, warn
 from linemap_jax.cli.options import LogInput, UsageError, check_input
-from linemap_jax.cli.output import say
+from linemap_jax.cli.output import check_output, make_folder, say
 
 if TYPE_CHECKING:
     from linemap_jax.io.log import Log
@@ -40,7 +41,7 @@ class Export(LogInput):
 
     def run(self) -> int:
         """Write it, and give the exit status."""
-        from linemap_jax.io.exports import FORMATS, LOG_NEEDED, Content, format_of
+        from linemap_jax.io.exports import FORMATS, LOG_NEEDED, Content, files_of, format_of
 
         name = self.to or format_of(self.output)
         if name is None:
@@ -51,6 +52,7 @@ class Export(LogInput):
         if not 0 < self.resolution < float("inf"):
             raise UsageError(f"--resolution must be positive, not {self.resolution}")
         check_input(self)
+        check_output(self.output.parent, *files_of(name, self.output), overwrite=self.overwrite)
         import jax
 
         jax.config.update("jax_enable_x64", True)
@@ -60,18 +62,22 @@ class Export(LogInput):
         line_map, settings = read_map(self.map)
         added: dict[str, Any] = {}
         if self.log is not None and name not in ("json", "geojson"):
-            log = opened(self, self.log)
+            command = at_poses_of_map(self, self.log, self.map, settings, quiet=self.quiet)
+            log = opened(command, self.log)
+            fit = Fit(line_map, mount_of(command, log, quiet=self.quiet))
             with progress(log, quiet=self.quiet):
-                added = _read(self, log, name)
+                added = _read(command, log, name, fit)
             warn(log, quiet=self.quiet)
+            fit.warn(log, self.map, quiet=self.quiet)
         title = str(settings.get("log", self.map.name))
         content = Content(line_map=line_map, settings=settings, title=title, **added)
+        make_folder(self.output.parent)
         FORMATS[name].write(self.output, content, self.overwrite)
         say(f"{self.map} -> {self.output} ({name})", quiet=self.quiet)
         return 0
 
 
-def _read(command: Export, log: "Log", name: str) -> dict[str, Any]:
+def _read(command: Export, log: "Log", name: str, fit: Fit) -> dict[str, Any]:
     """What a format wants of a log, by the fields of `Content`."""
     import numpy as np
 
@@ -82,18 +88,20 @@ def _read(command: Export, log: "Log", name: str) -> dict[str, Any]:
     from linemap_jax.io.thinned import Thinned
     from linemap_jax.lab.occupancy import occupancy, returns_in_world
 
-    mount = mount_of(command, log, quiet=command.quiet)
+    pose_frame = next(iter(log)).pose_frame
     if name == "nav2":
         try:
-            return {"grid": occupancy(lambda: plain_chunks(log), mount, resolution=command.resolution)}
+            return {"grid": occupancy(lambda: fit.through(plain_chunks(log)), fit.mount, resolution=command.resolution)}
         except ValueError as error:
             raise UsageError(f"{log.path}: {error}") from error
     timestamps, poses, points = [], [], Thinned(2 * MOST_POINTS)
     for chunk in chunks_of_readings(log, CHUNK, cov_pose=np.zeros((3, 3)), dtype="float64"):
+        fit.look_at(chunk.scans, chunk.poses)
         timestamps.append(chunk.timestamps)
         poses.append(np.asarray(chunk.poses.mean))
         if name == "html":
-            _, places, valid = returns_in_world(chunk.scans, chunk.poses, mount)
+            _, places, valid = returns_in_world(chunk.scans, chunk.poses, fit.mount)
             points.extend(places[valid])
     found: dict[str, Any] = {"timestamps": np.concatenate(timestamps), "poses": np.concatenate(poses)}
+    found["pose_frame"] = pose_frame
     return found | ({"points": np.array(points.kept).reshape(-1, 2)} if name == "html" else {})

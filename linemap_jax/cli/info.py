@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,14 @@ SHARES = {
     "minus_inf": "too close (-inf)",
     "nan": "invalid (NaN)",
 }
+
+
+WHY = {
+    True: " (the poses are odometry's, which drifts)",
+    False: "",
+    None: " (or `slam`, if nobody has corrected the poses)",
+}
+"""Of the command to go on with, by whether the poses drift."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -61,7 +70,18 @@ def _told(command: Info, scan_topic: str | None) -> dict[str, Any]:
             next(iter(opened(chosen, command.log)))
         except LogError as error:
             told["refused"] = error.cause
+    if "refused" not in told:
+        told["next"] = _next(chosen, drift=told["drift"])
     return told
+
+
+def _next(command: Info, *, drift: bool | None) -> str:
+    """The command that makes a map of the log."""
+    words = ["linemap", "slam" if drift else "build", str(command.log), "-o", "my-map"]
+    for option in ("scan_topic", "odom_topic", "poses"):
+        if (value := getattr(command, option)) is not None:
+            words += [f"--{option.replace('_', '-')}", str(value)]
+    return shlex.join([*words, *(["--standstill"] if command.standstill else [])])
 
 
 def _of_scanner(told: dict[str, Any]) -> dict[str, Any]:
@@ -98,10 +118,16 @@ def _scanner_in_words(told: dict[str, Any]) -> list[str]:
         coverage = f", for {known} scans; covariance stated for {noise}" if known else ""
         said.append(f"poses:    {told['poses']}{coverage}")
         if told["mounting"]:
-            said.append(f"laser on the robot: {told['mounting']}")
+            where = ""
+            if told["mount_m_rad"] is not None:
+                x, y, theta = told["mount_m_rad"]
+                where = f"; x {x:.3f} m, y {y:.3f} m, yaw {math.degrees(theta):.1f} degrees"
+            said.append(f"laser on the robot: {told['mounting']}{where}")
         if told["scans_in_motion"]:
             said.append(f"motion during the sweep is corrected for {told['scans_in_motion']} scans")
         said += [f"warning:  {warning}" for warning in told["warnings"]]
     if "refused" in told:
         said.append(f"`linemap build` would refuse it: it {told['refused']}")
+    elif "next" in told:
+        said.append(f"next:     {told['next']}{WHY[told['drift']]}")
     return said

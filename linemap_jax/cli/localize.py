@@ -51,7 +51,7 @@ class Localize(LogOptions):
         options: dict[str, Any] = options_of_update(self)
         del options["persistence"]
         _check(self)
-        from linemap_jax.io.map_file import read_map
+        from linemap_jax.io.map_file import MapFileError, read_map
         from linemap_jax.io.plot import plot_map
         from linemap_jax.io.tum import write_covariances, write_tum
 
@@ -60,7 +60,12 @@ class Localize(LogOptions):
         beside, picture = tum.with_suffix(".csv"), tum.with_suffix(".png")
         files = [tum, beside, *([picture] if in_folder else [])]
         check_output(tum.parent, *files, overwrite=self.overwrite)
-        line_map, _ = read_map(self.map, dtype=self.dtype)
+        try:
+            line_map, _ = read_map(self.map, dtype=self.dtype)
+        except MapFileError as error:
+            if self.log.suffix in (".json", ".geojson") and self.map.exists():
+                raise UsageError(f"{error}; the map comes first, then the log") from error
+            raise
         if not line_map.lines.valid.any():
             raise UsageError(f"{self.map} holds no line: there is nothing to find the robot by")
         log = opened(self, self.log)

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from linemap_jax.cli.options import LogInput, LogOptions
+from linemap_jax.cli.options import LogInput, LogOptions, UsageError
 from linemap_jax.cli.output import say
 
 if TYPE_CHECKING:
@@ -27,7 +27,11 @@ def opened(command: LogInput, path: Path, *, need_poses: bool = True) -> "Log":
     from linemap_jax.io.log import open_log
     from linemap_jax.io.tum import read_tum
 
-    poses = Standstill() if command.standstill else None if command.poses is None else read_tum(command.poses)
+    poses = Standstill() if command.standstill else None
+    if command.poses is not None:
+        poses = read_tum(command.poses)
+        if poses.pose_frame == "laser" and command.laser_offset is not None:
+            raise UsageError(f"{command.poses} holds poses of the laser, to which --laser-offset does not apply")
     return open_log(
         path,
         strict=command.strict,

@@ -1,8 +1,9 @@
 """Reads the options, runs the command, and turns what goes wrong into one sentence."""
 
+import difflib
 import os
 import sys
-from typing import Annotated
+from typing import Annotated, get_args
 
 import tyro
 
@@ -16,6 +17,7 @@ from linemap_jax.cli.extract import Extract
 from linemap_jax.cli.info import Info
 from linemap_jax.cli.localize import Localize
 from linemap_jax.cli.merge import Merge
+from linemap_jax.cli.numbers import NUMBERS
 from linemap_jax.cli.options import UsageError
 from linemap_jax.cli.simulate import Simulate
 from linemap_jax.cli.slam import Slam
@@ -50,6 +52,10 @@ Command = (
 """What can be run; each holds its options."""
 
 
+NAMES = [get_args(kind)[1].name for kind in get_args(Command)]
+"""Of the commands."""
+
+
 def main(args: list[str] | None = None) -> int:
     """Run the command line.
 
@@ -60,13 +66,18 @@ def main(args: list[str] | None = None) -> int:
       The exit status: 0; 1 if `verify` found a check that fails; 2 for bad input, about which one sentence has been
       printed; 130 for an interrupt.
     """
-    command = tyro.cli(
-        Command,
-        prog="linemap",
-        description=DESCRIPTION,
-        config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
-        args=args,
-    )
+    args = sys.argv[1:] if args is None else args
+    if args and (unknown := _unknown(args[0])):
+        print(f"linemap: {unknown}", file=sys.stderr)
+        return 2
+    with NUMBERS:
+        command = tyro.cli(
+            Command,
+            prog="linemap",
+            description=DESCRIPTION,
+            config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
+            args=args,
+        )
     # What follows loads jax, which takes a second: not before the options are known to be right.
     from linemap_jax.io.atomic import OutputError
     from linemap_jax.io.config import ConfigError
@@ -86,3 +97,11 @@ def main(args: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("linemap: interrupted", file=sys.stderr)
         return 130
+
+
+def _unknown(word: str) -> str:
+    """What is wrong with the word that should be a command; empty if it is one, or an option."""
+    if word.startswith("-") or word in NAMES:
+        return ""
+    near = difflib.get_close_matches(word, NAMES, 1)
+    return f"there is no command {word!r}; " + (f"did you mean {near[0]}?" if near else f"there are {', '.join(NAMES)}")

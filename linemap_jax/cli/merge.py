@@ -12,6 +12,12 @@ from linemap_jax.cli.output import check_output, make_folder, say
 
 if TYPE_CHECKING:
     from linemap_jax.core.state import LineMap
+    from linemap_jax.lab.comparison import Agreement
+
+
+LEAST_AGREEING = 0.2
+"""Of the length of lines where two maps overlap, the share that lies along one of the other: of two drives of one place
+more than half, in different frames a twentieth."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -41,11 +47,11 @@ class Merge:
         from linemap_jax.core.merging import merge_maps
         from linemap_jax.io.map_file import write_map
         from linemap_jax.io.plot import plot_map
+        from linemap_jax.lab.comparison import agreement
 
         merged, report = merge_maps(a, b, pose_error=self.pose_error)
         joined = {name: int(getattr(report, name)) for name in ("lines_joined", "circles_joined", "circles_left_out")}
-        if not joined["lines_joined"]:
-            say(f"warning: no line of {self.b} is one of {self.a}: are both in one frame?", quiet=self.quiet)
+        warn_of_frames(self.a, self.b, agreement(a, b), quiet=self.quiet)
         make_folder(self.output)
         names = [str(each.get("log", path.name)) for each, path in zip(settings, (self.a, self.b), strict=True)]
         title = " + ".join(names)
@@ -76,6 +82,16 @@ def read_two_maps(a: Path, b: Path) -> tuple["LineMap", "LineMap", list[dict[str
     if one[0].lines.offset.dtype != other[0].lines.offset.dtype:
         one, other = read_map(a, dtype="float64"), read_map(b, dtype="float64")
     return one[0], other[0], [one[1], other[1]]
+
+
+def warn_of_frames(a: Path, b: Path, found: "Agreement", *, quiet: bool) -> None:
+    """Say so, if two maps agree so little that they will not be in one frame."""
+    if found.agreeing <= LEAST_AGREEING * found.overlap:
+        say(
+            f"warning: of {found.overlap:.1f} m of lines where {a} and {b} overlap only {found.agreeing:.1f} m agree: "
+            "are both in one frame (`linemap localize` finds a drive in the map of another)?",
+            quiet=quiet,
+        )
 
 
 def _counts(line_map: "LineMap") -> dict[str, int]:

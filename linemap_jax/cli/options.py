@@ -44,7 +44,8 @@ class LogInput:
     odom_topic: Annotated[str | None, tyro.conf.arg(metavar="TOPIC")] = None
     """Topic of the odometry to take poses from, for a bag with several, or in place of tf."""
     poses: Annotated[Path | None, tyro.conf.arg(metavar="FILE.tum")] = None
-    """Poses of the robot (timestamp tx ty tz qx qy qz qw), in place of those of the log."""
+    """Poses of the robot (timestamp tx ty tz qx qy qz qw), in place of those of the log; of the laser, if a comment in
+    the file says so, as `linemap slam` writes it."""
     standstill: bool = False
     """The robot did not move: for a log without poses."""
     strict: bool = False

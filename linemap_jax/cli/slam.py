@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import sys
+import time
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -35,16 +36,14 @@ class Slam(LogOptions):
     """CARMEN log, plain or .gz; ROS 1 .bag; ROS 2 bag: its folder, .mcap or .db3."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="DIR")]
     """Folder for the map and the trajectory; made if it is not there."""
-    trajectory_frame: Literal["laser", "base"] = "laser"
-    """Whose poses trajectory.tum holds: the laser's, or the robot's."""
+    trajectory_frame: Literal["base", "laser"] = "base"
+    """Whose poses trajectory.tum and .csv hold: the robot's, or the laser's."""
     json: bool = False
     """Print the summary as JSON."""
 
     def run(self) -> int:
         """Track, close loops, map, adjust; and give the exit status."""
         options: dict[str, Any] = options_of_update(self) | {"pose_error": "unknown"}
-        import numpy as np
-
         from linemap_jax.core.settings import Mount
         from linemap_jax.io.map_file import write_map
         from linemap_jax.io.plot import plot_map
@@ -54,8 +53,9 @@ class Slam(LogOptions):
         check_output(self.output, *files, overwrite=self.overwrite)
         log = opened(self, self.log)
         mount = mount_of_odometry(self, log)
+        started = time.perf_counter()
         with progress(log, quiet=self.quiet):
-            slammed, stamps, interrupted = _tracked(self, log, mount)
+            slammed, stamps, to_first, interrupted = _tracked(self, log, mount)
         warn(log, quiet=self.quiet)
         _tell_doubts(slammed, log, quiet=self.quiet)
 
@@ -68,6 +68,7 @@ class Slam(LogOptions):
         of_extract = {name: option for name, option in options.items() if name not in of_map}
         line_map, cov_keyframes = slammed.adjust(mapped.line_map, **of_extract)
         interrupted |= mapped.interrupted
+        seconds = time.perf_counter() - started
         trajectory = slammed.trajectory()
 
         make_folder(self.output)
@@ -75,31 +76,39 @@ class Slam(LogOptions):
             "log": self.log.name,
             "preset": self.preset,
             "pose_sigma": self.pose_sigma,
-            "slam": {"keyframes": len(slammed.keyframes), "loops": slammed.closures},
+            "slam": {
+                "keyframes": len(slammed.keyframes),
+                "loops": slammed.closures,
+                "laser_offset": self.laser_offset,  # to read the log once more at the trajectory
+            },
             **at_laser,
         }
         write_map(files[0], line_map, settings, overwrite=self.overwrite)
         plot_map(files[1], line_map, trajectory[:, :2], title=self.log.name, overwrite=self.overwrite)
-        poses = trajectory if self.trajectory_frame == "laser" else _of_base(trajectory, mount)
-        write_tum(files[2], stamps, poses, overwrite=self.overwrite)
-        covs, doubtful = slammed.cov_trajectory(cov_keyframes), np.concatenate(slammed.shares)[: len(stamps)] < DOUBTFUL
-        write_covariances(files[3], stamps, poses, covs, doubtful, overwrite=self.overwrite)
+        poses, covs = trajectory, slammed.cov_trajectory(cov_keyframes)
+        if self.trajectory_frame == "base":
+            poses, covs = _of_base(trajectory, covs, mount)
+        whose = "robot" if self.trajectory_frame == "base" else "laser"
+        write_tum(files[2], stamps, poses, pose_frame=whose, overwrite=self.overwrite)
+        write_covariances(files[3], stamps, poses, covs, _doubtful(slammed), overwrite=self.overwrite)
         if interrupted:
             print(f"linemap: interrupted; map and trajectory so far are in {self.output}", file=sys.stderr)
             return 130
-        summary = _summary(self, slammed, line_map, trajectory, files)
+        pace = _pace(stamps, seconds, to_first + mapped.seconds[0][0])
+        summary = _summary(self, slammed, line_map, trajectory, files) | pace
         print(json.dumps(summary, indent=2) if self.json else _in_words(summary))
         return 0
 
 
-def _tracked(command: Slam, log: "Log", mount: "Mount") -> tuple["Slammed", "np.ndarray", bool]:
-    """The log run through, the time stamps of its scans, and whether somebody interrupted it."""
+def _tracked(command: Slam, log: "Log", mount: "Mount") -> tuple["Slammed", "np.ndarray", float, bool]:
+    """The log run through, the time stamps of its scans, the seconds to the first chunk, and whether interrupted."""
     import numpy as np
 
     from linemap_jax import slam
     from linemap_jax.core.frames_on_host import compose
 
-    slammed, stamps, interrupted = slam.Slam(), [], False
+    slammed, stamps, to_first, interrupted = slam.Slam(), [], 0.0, False
+    started = time.perf_counter()
     on_robot = np.array([mount.x, mount.y, mount.theta], float)
     try:
         for chunk in chunks_of_log(command, log, slam.CHUNK):
@@ -110,11 +119,13 @@ def _tracked(command: Slam, log: "Log", mount: "Mount") -> tuple["Slammed", "np.
                 )
             stamps.append(chunk.timestamps)
             slammed.add(chunk.scans, compose(odometry, on_robot))
+            to_first = to_first or time.perf_counter() - started
     except KeyboardInterrupt:
         if len(slammed.keyframes) == 0:
             raise
         interrupted = True
-    return slammed, np.concatenate(stamps)[: len(slammed.trajectory())], interrupted
+        print(f"linemap: interrupted; mapping the {len(slammed.trajectory())} scans so far", file=sys.stderr)
+    return slammed, np.concatenate(stamps)[: len(slammed.trajectory())], to_first, interrupted
 
 
 def _at_poses(
@@ -140,28 +151,55 @@ def _first(count: int, x: Any) -> Any:
     return x[:count]
 
 
-def _of_base(trajectory: "np.ndarray", mount: "Mount") -> "np.ndarray":
-    """The poses of the robot that carries the laser."""
+def _of_base(trajectory: "np.ndarray", covs: "np.ndarray", mount: "Mount") -> tuple["np.ndarray", "np.ndarray"]:
+    """The poses of the robot that carries the laser, and their covariances."""
     import numpy as np
 
     from linemap_jax.core.frames_on_host import between, compose
 
     laser = np.array([mount.x, mount.y, mount.theta], float)
-    return compose(trajectory, between(laser, np.zeros(3)))
+    base = compose(trajectory, between(laser, np.zeros(3)))
+    # What turns the laser carries the robot around it: d base / d theta is the way from laser to robot, turned left.
+    jac = np.tile(np.eye(3), (len(base), 1, 1))
+    jac[:, 0, 2], jac[:, 1, 2] = trajectory[:, 1] - base[:, 1], base[:, 0] - trajectory[:, 0]
+    return base, jac @ covs @ np.swapaxes(jac, 1, 2)
+
+
+def _doubtful(slammed: "Slammed") -> "np.ndarray":
+    """Scans of which few points agree with what was seen before; before the first one nothing was. Shape `[T]`."""
+    import numpy as np
+
+    doubtful = np.concatenate(slammed.shares)[: len(slammed.trajectory())] < DOUBTFUL
+    doubtful[:1] = False
+    return doubtful
 
 
 def _tell_doubts(slammed: "Slammed", log: "Log", *, quiet: bool) -> None:
     """Say where the trajectory rests on odometry."""
-    import numpy as np
-
-    share = np.concatenate(slammed.shares)[1:]
-    doubtful = int((share < DOUBTFUL).sum())
-    if doubtful:
+    doubtful = _doubtful(slammed)
+    if doubtful.any():
         say(
-            f"warning: {log.path}: of {doubtful} of {len(share) + 1} scans few points agree with what was seen before; "
-            "there the trajectory rests on odometry",
+            f"warning: {log.path}: of {doubtful.sum()} of {len(doubtful)} scans few points agree with what was seen "
+            "before; there the trajectory rests on odometry",
             quiet=quiet,
         )
+
+
+def _pace(stamps: "np.ndarray", seconds: float, to_first: float) -> dict[str, float | None]:
+    """Time, without that to the first chunks, which hold most of the compilation; closing loops and adjusting is in it.
+
+    A mean over all scans, since loops do not close evenly. A log of one chunk does not tell.
+    """
+    import numpy as np
+
+    from linemap_jax.slam import CHUNK
+
+    pace = (seconds - to_first) / len(stamps) if len(stamps) > CHUNK else None
+    return {
+        "us_per_scan": None if pace is None else 1e6 * pace,
+        "times_real_time": None if pace is None else float(np.ptp(stamps)) / (pace * len(stamps)),
+        "seconds_to_first_chunk": to_first,
+    }
 
 
 def _summary(
@@ -191,11 +229,14 @@ def _summary(
 
 
 def _in_words(summary: dict[str, Any]) -> str:
+    pace = summary["us_per_scan"]
+    then = f"then {pace:.0f} us a scan, {summary['times_real_time']:.0f} times as fast as recorded" if pace else ""
     return (
         f"{summary['scans']} scans over {summary['driven_m']:.0f} m -> {summary['keyframes']} keyframes, "
         f"{summary['loops']} loops closed\n"
         f"{summary['lines']} lines, {summary['circles']} circles; {summary['explained']:.1%} of the returns under 20 m "
         "lie within 10 cm of them\n"
+        f"{summary['seconds_to_first_chunk']:.1f} s to compile, {then or 'too few scans to time'}\n"
         f"map:         {summary['map']}\n"
         f"picture:     {summary['picture']}\n"
         f"trajectory:  {summary['trajectory']}\n"

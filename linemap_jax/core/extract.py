@@ -28,7 +28,6 @@ from linemap_jax.core.settings import (
 from linemap_jax.core.slots import LARGEST, neutral_where_free
 from linemap_jax.core.state import Extraction, Pose, Rejected, Scan, Status
 
-
 ONE_AND_ROUNDING = 1.001
 """The square of the largest correlation that is taken for one."""
 

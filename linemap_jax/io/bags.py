@@ -201,10 +201,12 @@ class _Plan:
             parent, child = _first(bag, topics[0], lambda m: (_frame(m.header.frame_id), _frame(m.child_frame_id)))
             self._odometry = Track(parent, moves=True)
             notes.poses = f"nav_msgs/Odometry on {topics[0]}"
+            notes.drift = _last_part(parent) not in CORRECTED
             return Chain([self._odometry], []), child or _robot_frame(bag, [], ancestors)
         if fixed is not None:
             robot = next((name for name in below if tree.tracks[name].moves), self._laser)
             notes.poses = f"tf, {robot} in {fixed}"
+            notes.drift = not corrected if _last_part(fixed) in FIXED else None
             return tree.chain(robot, fixed), robot
         if not options.need_poses:
             notes.poses = "none"
@@ -299,7 +301,7 @@ class _Plan:
             pose=pose,
             cov_pose=cov,
             sweep_poses=sweep,
-            pose_frame="robot",
+            pose_frame=options.pose_frame,
             odometry=None,
             mount=self._mount,
             where=f"scan {scan.number}",
@@ -337,7 +339,9 @@ class _Plan:
             if abs(cosine) < _TILTED:
                 tilt = math.degrees(math.acos(min(abs(cosine), 1.0)))
                 notes.assume(f"the laser is tilted by {tilt:.0f} degrees; its scans were taken as if it were level")
-        if self._options.mount is not None:
+        if self._options.pose_frame == "laser":
+            self._mount, notes.mounting = self._options.mount, ""
+        elif self._options.mount is not None:
             self._mount, notes.mounting = self._options.mount, "given"
         elif chain is None and self.poses is not None and not isinstance(self.poses, Standstill):
             notes.mounting = "not known"

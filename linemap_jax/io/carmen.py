@@ -313,7 +313,7 @@ class _Parser:
             pose=pose,
             cov_pose=None,
             sweep_poses=None,
-            pose_frame="laser" if options.poses is None else "robot",
+            pose_frame="laser" if options.poses is None else options.pose_frame,
             odometry=tail[3:6].copy(),
             mount=None if options.poses is None else options.mount,
             where=f"line {number}",

@@ -4,7 +4,7 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from numpy.typing import ArrayLike
 
@@ -23,6 +23,7 @@ class Content:
     title: str
     timestamps: ArrayLike | None = None  # [T] s
     poses: ArrayLike | None = None  # [T, 3] x, y, theta: m, m, rad
+    pose_frame: Literal["laser", "robot"] = "robot"  # whose poses they are
     points: ArrayLike | None = None  # [P, 2] m, raw points
     grid: tuple[ArrayLike, ArrayLike, float] | None = None  # cells [H, W], origin [2] m, resolution m
 
@@ -89,7 +90,7 @@ def _tum(path: Path, content: Content, overwrite: bool) -> None:
 
     assert content.timestamps is not None
     assert content.poses is not None
-    write_tum(path, content.timestamps, content.poses, overwrite=overwrite)
+    write_tum(path, content.timestamps, content.poses, pose_frame=content.pose_frame, overwrite=overwrite)
 
 
 def _png(path: Path, content: Content, overwrite: bool) -> None:
@@ -118,6 +119,13 @@ FORMATS: dict[str, Format] = {
     "html": Format(".html", _html),
 }
 """All formats, by name."""
+
+
+def files_of(name: str, path: str | os.PathLike[str]) -> list[Path]:
+    """The files that a format writes for a path."""
+    from linemap_jax.io.nav2 import files_of_nav2
+
+    return list(files_of_nav2(path)) if name == "nav2" else [Path(path)]
 
 
 def format_of(path: str | os.PathLike[str]) -> str | None:

@@ -8,7 +8,7 @@ the plane is linear in the angle on the circle.
 import math
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterable
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 
@@ -115,16 +115,20 @@ class Poses(Protocol):
 
 
 class Trajectory:
-    """Poses in the plane at given stamps, interpolated between them."""
+    """Poses in the plane at given stamps, interpolated between them.
 
-    description = "of a given trajectory"
+    Attributes:
+      description: in words.
+      pose_frame: whose poses they are.
+    """
 
-    def __init__(self, stamps: np.ndarray, poses: np.ndarray) -> None:
+    def __init__(self, stamps: np.ndarray, poses: np.ndarray, pose_frame: Literal["robot", "laser"] = "robot") -> None:
         """A trajectory from stamps, s, and poses x, y, theta, m, m, rad.
 
         Args:
           stamps: finite, in any order; of equal ones the first counts. Shape `[T]`.
           poses: finite. Shape `[T, 3]`.
+          pose_frame: whose poses they are.
 
         Raises:
           ValueError: if there is no pose, or if stamps and poses differ in number or are not finite.
@@ -134,6 +138,8 @@ class Trajectory:
             raise ValueError(f"a trajectory needs T stamps and [T, 3] poses, not {stamps.shape} and {poses.shape}")
         if not (np.isfinite(stamps).all() and np.isfinite(poses).all()):
             raise ValueError("a stamp or a pose of the trajectory is not finite")
+        self.pose_frame: Literal["robot", "laser"] = pose_frame
+        self.description = "of a given trajectory" + (" of the laser" if pose_frame == "laser" else "")
         self.stamps, index = np.unique(stamps, return_index=True)
         self.poses = poses[index]
         self.poses[:, 2] = np.unwrap(self.poses[:, 2])

@@ -15,7 +15,7 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 
-from linemap_jax.io.frames import Poses
+from linemap_jax.io.frames import Poses, Trajectory
 
 Progress = Callable[[int, int], None]
 """Called with the bytes of the file consumed so far and the bytes in all, as they lie on the disk; of a bag by the time
@@ -103,6 +103,7 @@ class Notes:
     scan_topics: list[str] = field(default_factory=list)  # all that hold scans
     frames: list[str] = field(default_factory=list)  # where frames are: "laser in base_link (static)"
     poses: str = ""  # where the poses come from, in words
+    drift: bool | None = None  # whether the poses are odometry's, which nobody has corrected; None if nothing says so
     mounting: str = ""  # how the laser sits on the robot, in words
     stated_covs: int = 0  # delivered scans whose pose comes with a covariance
     swept: int = 0  # delivered scans whose beams were measured at different poses
@@ -193,6 +194,7 @@ class Options:
     odom_topic: str | None = None
     mount: tuple[float, float, float] | None = None
     poses: Poses | None = None
+    pose_frame: Literal["laser", "robot"] = "robot"  # whose poses those are
     need_poses: bool = True
 
 
@@ -247,7 +249,8 @@ def open_log(
       scan_topic: of a bag with several scanners, the one to read.
       odom_topic: of a bag, the `nav_msgs/Odometry` to take poses from.
       mount: of the laser on the robot, m, m, rad, in place of what the log states; for poses that are the robot's.
-      poses: of the robot, in place of those of the log. Scans beyond them are left out and counted.
+      poses: of the robot, in place of those of the log. Scans beyond them are left out and counted. Where they are the
+        laser's, what carries it is the laser itself: no mount is applied.
       need_poses: whether a scan without a pose is of any use. If it is, such scans are delivered too.
       progress: called now and then while reading, with the bytes consumed and the bytes in all.
 
@@ -256,8 +259,8 @@ def open_log(
 
     Raises:
       LogError: if the file is missing, no regular file, empty, unreadable, or of an unknown format.
-      ValueError: if a range or the mount is not finite and positive where it must be, or `bearing_override` is not a
-        sweep.
+      ValueError: if a range or the mount is not finite and positive where it must be, `bearing_override` is not a
+        sweep, or a mount is given with poses of the laser.
     """
     from linemap_jax.io import carmen  # The readers build on this module.
 
@@ -271,6 +274,11 @@ def open_log(
             raise ValueError(f"bearing_override must be a first bearing and a step in radians, not {bearing_override}")
     if mount is not None and not all(map(math.isfinite, mount)):
         raise ValueError(f"mount must be finite, not {mount}")
+    pose_frame = poses.pose_frame if isinstance(poses, Trajectory) else "robot"
+    if pose_frame == "laser":
+        if mount is not None:
+            raise ValueError("the poses are the laser's, to which no mount applies")
+        mount = (0.0, 0.0, 0.0)
     options = Options(
         strict=strict,
         range_min=range_min,
@@ -280,6 +288,7 @@ def open_log(
         odom_topic=odom_topic,
         mount=mount,
         poses=poses,
+        pose_frame=pose_frame,
         need_poses=need_poses,
     )
     magic = _magic(path)

@@ -11,6 +11,7 @@ import dataclasses
 import json
 import os
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, Literal
 
 import jax
@@ -111,7 +112,7 @@ def read_map(
     """Read a map that `write_map` wrote, in either form.
 
     Args:
-      path: of the file.
+      path: of the file, or of a folder with a `map.json` in it.
       capacity: slots of the map; the next power of two unless given.
       dtype: of the map; that of the file unless given.
 
@@ -239,12 +240,18 @@ def _text(document: dict[str, Any]) -> str:
     return "{\n" + ",\n".join(parts) + "\n}\n"
 
 
+def map_in(path: str | os.PathLike[str]) -> Path:
+    """The file that is meant: of a folder, as `linemap build` writes it, the `map.json` in it."""
+    path = Path(path)
+    return path / "map.json" if path.is_dir() else path
+
+
 def _load(path: str | os.PathLike[str]) -> dict[str, Any]:
     """The document, its head checked."""
     try:
-        document = read_json(path)
+        document = read_json(map_in(path))
     except OSError as error:
-        raise MapFileError(f"cannot read {os.fspath(path)}: {error.strerror or error}") from error
+        raise MapFileError(f"cannot read {map_in(path)}: {error.strerror or error}") from error
     except JsonError as error:
         raise _Fault(str(error)) from None
     if not isinstance(document, dict) or document.get("format") != FORMAT:

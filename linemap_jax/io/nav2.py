@@ -15,6 +15,12 @@ OCCUPIED_THRESH, FREE_THRESH = 0.65, 0.196
 """Of (255 - grey) / 255. The grey of unknown cells has 0.1961, so that 0.25, as some files have it, makes them free."""
 
 
+def files_of_nav2(path: str | os.PathLike[str]) -> tuple[Path, Path]:
+    """The YAML file and the picture that `write_nav2` writes for a path."""
+    path = Path(path) if Path(path).suffix in (".yaml", ".yml") else Path(path).with_suffix(".yaml")
+    return path, path.with_suffix(".pgm")
+
+
 def write_nav2(
     path: str | os.PathLike[str], cells: ArrayLike, origin: ArrayLike, resolution: float, *, overwrite: bool = False
 ) -> None:
@@ -35,8 +41,7 @@ def write_nav2(
     grey = np.full(values.shape, GREYS[-1], np.uint8)
     for value in (0, 100):
         grey[values == value] = GREYS[value]
-    path = Path(path) if Path(path).suffix in (".yaml", ".yml") else Path(path).with_suffix(".yaml")
-    picture = path.with_suffix(".pgm")
+    path, picture = files_of_nav2(path)
     x, y = np.asarray(origin, float).tolist()
     description = (
         f"image: {json.dumps(picture.name)}\n"  # a string of JSON is one of YAML

@@ -23,8 +23,9 @@ def describe(log: Log) -> dict[str, Any]:
     Returns:
       Numbers and words for JSON: `format`, `messages` with their types, `frames`; of the scans `scans`, `duration_s`,
       `rate_hz`, `beams`, `bearings_rad` (first, step, last), `range_min_m`, `range_max_m`, the shares of what beams
-      brought back, and the share of scans with a pose; `warnings`. If no scan can be read, `refused` says why, and what
-      is told of scans is missing.
+      brought back, the number of scans with a pose, and where the laser sits on the robot, `mount_m_rad`; whether the
+      poses are odometry's, `drift`, None where the log does not say; `warnings`. If no scan can be read, `refused` says
+      why, and what is told of scans is missing.
 
     Raises:
       LogError: if the log cannot be read, and holds no message that tells anything.
@@ -42,7 +43,8 @@ def describe(log: Log) -> dict[str, Any]:
     told = {"log": str(log.path), "format": log.format, "messages": messages, "frames": notes.frames}
     if refused is not None:
         return told | {"refused": refused}
-    return told | seen.told() | {"poses": notes.poses, "mounting": notes.mounting or None, "warnings": notes.warnings()}
+    of_poses = {"poses": notes.poses, "drift": notes.drift, "mounting": notes.mounting or None}
+    return told | seen.told() | of_poses | {"warnings": notes.warnings()}
 
 
 class _Seen:
@@ -105,4 +107,5 @@ class _Seen:
             "scans_with_pose": self.with_pose,
             "scans_with_covariance": self.with_cov,
             "scans_in_motion": self.swept,
+            "mount_m_rad": None if first.mount is None else list(first.mount),
         }

@@ -1,6 +1,8 @@
 """Trajectories in the format of the TUM RGB-D benchmark, which tools for comparing trajectories read and write."""
 
 import os
+import re
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -9,9 +11,14 @@ from linemap_jax.io.atomic import atomic_write
 from linemap_jax.io.frames import Trajectory, planar, transform_of
 from linemap_jax.io.log import LogError
 
+_WHOSE = re.compile(r"#\s*poses of the (robot|laser)\b")
+"""The comment by which a trajectory says whose poses it holds."""
+
 
 def read_tum(path: str | os.PathLike[str]) -> Trajectory:
     """Read poses, one a line: `timestamp tx ty tz qx qy qz qw`, seen from above; lines that begin with # are comments.
+
+    They are the robot's, unless a comment has it that they are `poses of the laser`.
 
     Args:
       path: of the file.
@@ -19,12 +26,14 @@ def read_tum(path: str | os.PathLike[str]) -> Trajectory:
     Raises:
       LogError: if the file cannot be read, a line is no pose, or there is none; it names the line.
     """
-    stamps, poses = [], []
+    stamps, poses, pose_frame = [], [], "robot"
     try:
         with open(path, encoding="utf-8") as file:
             for number, line in enumerate(file, 1):
                 fields = line.replace(",", " ").split("#", 1)[0].split()
                 if not fields:
+                    if told := _WHOSE.match(line):
+                        pose_frame = told[1]
                     continue
                 pose = _pose(fields)
                 if pose is None:
@@ -37,7 +46,7 @@ def read_tum(path: str | os.PathLike[str]) -> Trajectory:
         raise LogError(path, "is no text, so not a trajectory in the format of TUM") from error
     if not stamps:
         raise LogError(path, "holds no pose")
-    return Trajectory(np.array(stamps), np.array(poses))
+    return Trajectory(np.array(stamps), np.array(poses), "laser" if pose_frame == "laser" else "robot")
 
 
 def _pose(fields: list[str]) -> tuple[float, float, float] | None:
@@ -53,14 +62,20 @@ def _pose(fields: list[str]) -> tuple[float, float, float] | None:
 
 
 def write_tum(
-    path: str | os.PathLike[str], timestamps: ArrayLike, poses: ArrayLike, *, overwrite: bool = False
+    path: str | os.PathLike[str],
+    timestamps: ArrayLike,
+    poses: ArrayLike,
+    *,
+    pose_frame: Literal["robot", "laser"] = "robot",
+    overwrite: bool = False,
 ) -> None:
-    """Write poses in the plane, one a line: `timestamp tx ty tz qx qy qz qw`; z is up.
+    """Write poses in the plane, one a line: `timestamp tx ty tz qx qy qz qw`; z is up. A comment says whose they are.
 
     Args:
       path: of the file.
       timestamps: s. Shape `[T]`.
       poses: x, y, theta. m, m, rad. Shape `[T, 3]`.
+      pose_frame: whose poses they are.
       overwrite: whether an older file may be replaced.
 
     Raises:
@@ -68,7 +83,8 @@ def write_tum(
     """
     x, y, theta = np.asarray(poses, float).T
     rows = zip(np.asarray(timestamps, float), x, y, np.sin(theta / 2), np.cos(theta / 2), strict=True)
-    text = "".join(f"{t:.6f} {x:.9f} {y:.9f} 0 0 0 {qz:.12f} {qw:.12f}\n" for t, x, y, qz, qw in rows)
+    head = f"# poses of the {pose_frame}: timestamp tx ty tz qx qy qz qw\n"
+    text = head + "".join(f"{t:.6f} {x:.9f} {y:.9f} 0 0 0 {qz:.12f} {qw:.12f}\n" for t, x, y, qz, qw in rows)
     with atomic_write(path, overwrite=overwrite) as temporary:
         temporary.write_text(text, encoding="ascii", newline="\n")
 

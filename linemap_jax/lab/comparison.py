@@ -38,6 +38,13 @@ END_SIGMAS = 3.0
 END_SLACK = 0.1
 """m. How far the ends of one wall may lie apart in two maps beside that: a corner is rounded by some beams."""
 
+BESIDE = 0.1
+"""m. A line that is no farther from a longer one, all along, is a piece of it."""
+REACH = 1.0
+"""m. Where one map has a line and the other one none that near, they do not overlap."""
+STEP = 0.1
+"""m. Lengths are summed up in pieces of at most that."""
+
 What = Literal["moved", "vanished", "appeared"]
 
 
@@ -95,9 +102,11 @@ def compare_maps(
 ) -> Comparison:
     """What has changed from one map to another.
 
-    A line has moved if all lines of the other map near it differ from it significantly; the nearest one is taken for
-    it. It has vanished if there is none. Of a line that is there still, pieces that the other map does not hold have
-    vanished too (a door was opened); and it has moved along itself if both ends have, by the same distance.
+    A line has moved if all lines of the other map near it differ from it significantly; the most likely one, that with
+    the least normalised distance, is taken for it, and the p-value holds given that it is. It has vanished if there is
+    none. Of a line that is there still, pieces that the other map does not hold have vanished too (a door was opened);
+    and it has moved along itself if both ends have, by the same distance. A map may hold a piece of a wall once more:
+    what lies on a longer line is there still if that one is.
 
     Args:
       a: the map before.
@@ -120,8 +129,10 @@ def compare_maps(
     p_line[pairs.near], p_circle[fitted] = np.split(holm(raw), [int(pairs.near.sum())])
 
     same = pairs.near & (p_line >= alpha)
-    free_a, free_b = (np.flatnonzero(x) for x in (lines_a.valid & ~same.any(1), lines_b.valid & ~same.any(0)))
-    moved = list(_nearest_first(np.where(pairs.near, np.abs(pairs.offset), np.inf), free_a, free_b))
+    on_a, on_b = (_lie_on(walls).astype(np.float32) for walls in (lines_a, lines_b))  # products of bool are slow
+    held = on_a @ same.astype(np.float32) @ on_b.T > 0
+    free_a, free_b = (np.flatnonzero(x) for x in (lines_a.valid & ~held.any(1), lines_b.valid & ~held.any(0)))
+    moved = list(_nearest_first(np.where(pairs.near, pairs.nis, np.inf), free_a, free_b))
     slide, p_slide = _slides(lines_a, lines_b, same)
     slid = [(int(i), int(j)) for i, j in np.argwhere(p_slide < alpha)]
     changes = [
@@ -132,8 +143,8 @@ def compare_maps(
         *(_moved_line(lines_a, lines_b, pairs, at, slide[at] * lines_a.tangent[at[0]], p_slide[at]) for at in slid),
     ]
     moved_a, moved_b = ({at[side] for at in moved + slid} for side in (0, 1))
-    changes += _missing_lines("vanished", lines_a, lines_b, same, moved_a, shortest)
-    changes += _missing_lines("appeared", lines_b, lines_a, same.T, moved_b, shortest)
+    changes += _missing_lines("vanished", lines_a, lines_b, held, moved_a, shortest)
+    changes += _missing_lines("appeared", lines_b, lines_a, held.T, moved_b, shortest)
     found, same_circles = _circle_changes(a, b, circle_pairs, p_circle, alpha)
     changes = [change for change in changes + found if change.times_detected >= at_least]
     order = {"moved": 0, "vanished": 1, "appeared": 2}
@@ -143,7 +154,24 @@ def compare_maps(
         far = math.hypot(*change.shift) / (change.sigma or 1) if change.shift else 0.0
         return order[change.what], -far, -length
 
-    return Comparison(sorted(changes, key=rank), int(same.any(1).sum()) - len(slid), same_circles, raw.size)
+    return Comparison(sorted(changes, key=rank), int(held.any(1).sum()) - len(slid), same_circles, raw.size)
+
+
+class Agreement(NamedTuple):
+    """How far two maps are of one place in one frame."""
+
+    overlap: float  # m, of lines within `REACH` of a line of the other map, the mean of both maps
+    agreeing: float  # m, of lines that lie along one of the other map, within `BESIDE` and `FARTHEST_TURN`
+
+
+def agreement(a: LineMap, b: LineMap) -> Agreement:
+    """What length of the lines of two maps lies where the other one has lines, and what of it lies along one.
+
+    Of maps of one place most of the one does, covariances apart; of maps in different frames a few per cent, by chance.
+    """
+    walls = [_Walls(*map(np.asarray, _walls(m.lines))) for m in (a, b)]
+    one, other = _lengths_beside(*walls), _lengths_beside(*walls[::-1])
+    return Agreement((one[0] + other[0]) / 2, (one[1] + other[1]) / 2)
 
 
 def holm(p: Float[np.ndarray, " M"]) -> Float[np.ndarray, " M"]:
@@ -242,6 +270,7 @@ class _Pairs(NamedTuple):
     offset: Float[np.ndarray, "K L"]  # m, second less first, along the normal of the first
     turn: Float[np.ndarray, "K L"]  # rad
     sigma: Float[np.ndarray, "K L"]  # m, of the offset
+    nis: Float[np.ndarray, "K L"]  # normalised distance
     p: Float[np.ndarray, "K L"]
 
 
@@ -264,7 +293,38 @@ def _line_pairs(a: Lines, b: Lines, walls_a: _Walls, walls_b: _Walls, within: fl
     near = walls_a.valid[:, None] & walls_b.valid[None] & (np.abs(turn) <= FARTHEST_TURN) & (np.abs(offset) <= within)
     near = near & (-gap >= OVERLAP * np.minimum(length_a[:, None], length_b[None]))
     # chi-square with 2 degrees of freedom: P(d^2 > x) = exp(-x / 2)
-    return _Pairs(near, offset, turn, sigma, np.exp(-nis / 2))
+    return _Pairs(near, offset, turn, sigma, nis, np.exp(-nis / 2))
+
+
+def _lie_on(walls: _Walls) -> Bool[np.ndarray, "K K"]:
+    """Whether a line, of which there is one for each row, is a longer one of the same map or a piece of it."""
+    length = walls.extent[:, 1] - walls.extent[:, 0]
+    ends = np.stack([walls.begin, walls.end], 1)[:, None] - walls.foot[None, :, None]  # of each, from each other one
+    across, along = (np.einsum("klei,li->kle", ends, axis) for axis in (walls.normal, walls.tangent))
+    low, high = (walls.extent[:, side] + slack for side, slack in ((0, -END_SLACK), (1, END_SLACK)))
+    turned = np.abs(walls.tangent @ walls.normal.T) > math.sin(FARTHEST_TURN)
+    beside = (np.abs(across) <= BESIDE).all(-1) & (low[:, None] <= along).all(-1) & (along <= high[:, None]).all(-1)
+    piece = beside & ~turned & (length[:, None] < length) & walls.valid[:, None] & walls.valid
+    return piece | np.eye(len(length), dtype=bool)
+
+
+def _lengths_beside(lines: _Walls, others: _Walls) -> tuple[float, float]:
+    """The length of lines near others, and along others."""
+    other = np.flatnonzero(others.valid)
+    begin, normal, tangent = others.foot[other], others.normal[other], others.tangent[other]
+    low, high = others.extent[other].T
+    near = along = 0.0
+    for i in np.flatnonzero(lines.valid) if other.size else ():
+        first, last = lines.extent[i]
+        count = max(1, math.ceil((last - first) / STEP))
+        places = first + (np.arange(count) + 0.5) * (last - first) / count
+        way = lines.foot[i] + places[:, None] * lines.tangent[i] - begin[:, None]  # [others, places, 2]
+        across, ahead = (np.einsum("lpi,li->lp", way, axis) for axis in (normal, tangent))
+        far = np.hypot(across, ahead - np.clip(ahead, low[:, None], high[:, None]))
+        parallel = np.abs(normal @ lines.tangent[i]) <= math.sin(FARTHEST_TURN)
+        near += (far <= REACH).any(0).mean() * (last - first)
+        along += (far[parallel] <= BESIDE).any(0).mean() * (last - first)
+    return float(near), float(along)
 
 
 def _slides(

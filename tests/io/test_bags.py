@@ -299,7 +299,22 @@ def test_poses_of_the_user_go_before_those_of_the_log(tmp_path):
     np.testing.assert_allclose([r.pose[2] for r in readings], 3 + (2 * np.pi - 6) * np.array([1, 3, 5]) / 6, atol=1e-5)
     assert readings[0].cov_pose is None
     assert readings[0].mount == pytest.approx((0.2, 0.1, 0.1))
-    assert (notes.poses, notes.without_pose) == ("of a given trajectory", 1)
+    assert (notes.poses, notes.without_pose, notes.drift) == ("of a given trajectory", 1, None)
+    # Those of the laser are where it is, wherever it sits on the robot.
+    readings, notes = read(path, poses=Trajectory(trajectory.stamps, trajectory.poses, "laser"))
+    assert (readings[0].pose_frame, readings[0].mount) == ("laser", (0, 0, 0))
+    assert (notes.poses, notes.mounting) == ("of a given trajectory of the laser", "")
+    with pytest.raises(ValueError, match="no mount applies"):
+        read(path, poses=Trajectory(trajectory.stamps, trajectory.poses, "laser"), mount=(0.1, 0, 0))
+
+
+@pytest.mark.parametrize(("frame", "drift"), [("odom", True), ("robot/odom", True), ("map", False), ("/world", False)])
+def test_odometry_drifts_unless_it_is_in_a_corrected_frame(tmp_path, frame, drift):
+    recording = Recording()
+    for i in range(3):
+        recording.odometry(100.0 + i, (i, 0, 0), frame=frame)
+        recording.scan(100.0 + i, RANGES)
+    assert read(recording.write(tmp_path))[1].drift == drift
 
 
 def test_a_log_without_poses(tmp_path):

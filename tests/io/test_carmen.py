@@ -621,6 +621,8 @@ def test_given_poses_are_the_robots_and_scans_beyond_them_are_left_out(write):
     np.testing.assert_allclose(readings[1].pose, [0.5, 1.0, math.pi])
     assert (readings[0].pose_frame, readings[0].mount, readings[0].range_min) == ("robot", (0.1, 0.2, 0.3), 1.5)
     assert notes.without_pose == 1
+    of_laser = Trajectory(poses.stamps, poses.poses, "laser")
+    assert (read(write(*lines), poses=of_laser)[0][0].pose_frame, notes.drift) == ("laser", None)
     readings, _ = read(write(*lines), poses=poses, need_poses=False)
     assert [r.pose is None for r in readings] == [True, False, False, False]
     late = Trajectory(np.array([1e3]), np.zeros((1, 3)))

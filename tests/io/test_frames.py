@@ -154,6 +154,7 @@ def test_a_trajectory_is_written_and_read(tmp_path):
     write_tum(tmp_path / "poses.tum", stamps, poses)
     found = read_tum(tmp_path / "poses.tum")
     assert found.covers(0, 19)
+    assert (found.pose_frame, found.description) == ("robot", "of a given trajectory")
     difference = found.at(stamps) - poses
     np.testing.assert_allclose(difference[:, :2], 0, atol=1e-8)
     np.testing.assert_allclose(np.sin(difference[:, 2] / 2), 0, atol=1e-8)
@@ -179,3 +180,13 @@ def test_a_file_that_is_no_trajectory(tmp_path, text, cause):
     assert str(caught.value).startswith(f"{path}{cause}")
     with pytest.raises(LogError, match="No such file"):
         read_tum(tmp_path / "none.tum")
+
+
+def test_a_trajectory_says_whose_poses_it_holds(tmp_path):
+    path = tmp_path / "poses.tum"
+    write_tum(path, [0.0, 1.0], np.zeros((2, 3)), pose_frame="laser")
+    assert path.read_text().startswith("# poses of the laser: timestamp tx ty tz qx qy qz qw\n")
+    found = read_tum(path)
+    assert (found.pose_frame, found.description) == ("laser", "of a given trajectory of the laser")
+    path.write_text("# another comment, on poses of the laser\n0 0 0 0 0 0 0 1\n")
+    assert read_tum(path).pose_frame == "robot"

@@ -12,7 +12,7 @@ from maps import lines_between, poles_at
 from scipy import stats
 
 from linemap_jax.core.state import LineMap, Pose, Scan
-from linemap_jax.lab.comparison import Change, Comparison, compare_maps, holm, looked_through
+from linemap_jax.lab.comparison import Change, Comparison, agreement, compare_maps, holm, looked_through
 
 SIGMA = 0.01, 0.003
 ROOM = [(-5, -4), (5, -4), (5, 4), (-5, 4)]
@@ -91,6 +91,42 @@ def test_a_door_that_was_opened_and_a_line_that_was_seen_farther() -> None:
     found = compare_maps(seen(wall((-4, 0))), seen(wall((-4, 3)), seed=1))
     (more,) = found.changes
     assert (more.what, sorted((more.begin[0], more.end[0]))) == ("appeared", pytest.approx([0, 3], abs=0.01))
+
+
+def test_a_piece_of_a_wall_that_is_held_once_more_has_not_moved() -> None:
+    """It turns away from the wall, as such pieces do, by much more than its sigmas."""
+    piece = np.array([[(1.0, -3.98), (1.7, -3.93)]])
+    before, after = seen(piece), seen(seed=1)
+    assert compare_maps(before, after).changes == []
+    assert compare_maps(after, before).changes == []
+    assert compare_maps(before, after).same_lines == 5
+    # Where the wall itself is gone, so is its piece.
+    gone = dataclasses.replace(after.lines, valid=after.lines.valid & (jnp.arange(32) != 0))
+    assert len(told(compare_maps(before, dataclasses.replace(after, lines=gone)), "vanished")) == 2
+
+
+def test_the_most_likely_partner_is_tested() -> None:
+    """A line between two: the nearer one is known far too well to be it."""
+    there, near, far = ([[(-1.0, y), (1.0, y)]] for y in (0.0, 0.2, 0.3))
+    exact, loose = (lines_between(near, sigma=(0.002, 0.001)), lines_between(far, sigma=(0.06, 0.02)))
+    both = jax.tree.map(lambda x, y: jnp.concatenate([x[:1], y[:1]]), exact, loose)
+    maps = [LineMap(lines=x, circles=poles_at([])) for x in (lines_between(there, sigma=(0.002, 0.001)), both)]
+    (moved,) = told(compare_maps(*maps), "moved")
+    assert moved.slot_b == 1
+    assert math.hypot(*moved.shift or ()) == pytest.approx(0.3)
+
+
+def test_maps_that_are_not_in_one_frame_agree_by_chance_alone() -> None:
+    before, after = seen(box(0, 0)), seen(box(2, 0), seed=1)
+    alike = agreement(before, after)
+    assert alike == pytest.approx(agreement(after, before))
+    # The outline is 36 m long; of the 4 m of a box one side is a metre from the other.
+    assert alike.agreeing == pytest.approx(36, abs=0.5)
+    assert 36 < alike.overlap < 40
+    ends = np.concatenate([outline(ROOM), box(0, 0)]) @ [[0.8, 0.6], [-0.6, 0.8]] + [2.0, 1.0]
+    turned = LineMap(lines=lines_between(ends, room=32), circles=poles_at([]))
+    assert agreement(before, turned).agreeing < 0.05 * agreement(before, turned).overlap
+    assert agreement(before, LineMap(lines=lines_between([]), circles=poles_at([]))) == (0, 0)
 
 
 def test_where_nothing_has_changed_hardly_anything_is_told() -> None:
