@@ -357,7 +357,7 @@ def simulated_drive(count: int, dtype: str) -> tuple[Scan, Pose]:
     of_world, of_drive = jax.random.split(jax.random.key(SEED))
     log = simulate.simulate(
         of_drive,
-        generators.laboratory(of_world, change=count),
+        generators.laboratory(of_world, scans=count),
         scanners.pls(),
         count=count,
         cov_pose=jnp.diag(jnp.square(jnp.asarray((0.01, 0.01, 0.002)))),

@@ -33,7 +33,7 @@ POSE_SIGMA = (0.01, 0.01, 0.00175)  # m, m, rad (0.1 degrees); independent from 
 
 def simulated() -> Simulation:
     """The drive, with the box and the door changed at half of it."""
-    world = laboratory(jax.random.key(SEED), jitter=0.0, change=SCANS // 2)
+    world = laboratory(jax.random.key(SEED), scans=SCANS, jitter=0.0)
     log = simulate(
         jax.random.key(SEED),
         world,

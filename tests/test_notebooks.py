@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import nbformat
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -13,7 +14,7 @@ NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 LARGEST = 700_000
 """Bytes of a notebook with its pictures: whoever clones the project pays for them."""
 
-pytestmark = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 
 
 def run_notebooks(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
@@ -43,6 +44,7 @@ def kinds_of_output(cell: dict) -> set[str]:
     return {output.get("name", output["output_type"]) for output in cell["outputs"]}
 
 
+@each_notebook
 def test_it_runs(path, tmp_path):
     before = path.read_bytes()
     done = run_notebooks("-o", tmp_path, path)
@@ -55,6 +57,7 @@ def test_it_runs(path, tmp_path):
         assert kinds_of_output(cell) - {"stderr"} == kinds_of_output(other)
 
 
+@each_notebook
 def test_its_outputs_are_kept(path):
     cells = code_cells(path)
     assert [cell["execution_count"] for cell in cells] == list(range(1, len(cells) + 1))
@@ -64,3 +67,16 @@ def test_its_outputs_are_kept(path):
         assert not kinds & {"error", "stderr"}, cell["outputs"]
     assert "(quick)" not in json.dumps([cell["outputs"] for cell in cells])
     assert path.stat().st_size < LARGEST
+
+
+def test_a_cell_that_takes_too_long_is_told(tmp_path):
+    path = tmp_path / "slow.ipynb"
+    cells = [nbformat.v4.new_code_cell("import time\ntime.sleep(60)")]
+    nbformat.write(nbformat.v4.new_notebook(cells=cells), path)
+    before = path.read_bytes()
+    done = run_notebooks("--timeout", "1", "-o", tmp_path, path)
+    assert done.returncode == 1
+    assert f"{path}: a cell took longer than 1 s; on a slow or busy machine give --timeout SECONDS" in done.stderr
+    assert "time.sleep(60)" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert path.read_bytes() == before

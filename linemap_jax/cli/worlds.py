@@ -20,7 +20,7 @@ def made_world(kind: WorldKind, key: "Array", *, scans: int) -> "World":
     from linemap_jax.lab import generators
 
     if kind == "laboratory":
-        return generators.laboratory(key, change=scans // 2)
+        return generators.laboratory(key, scans=scans)
     if kind == "changing_room":
         return generators.changing_room(key, scans=scans)
     if kind == "corridor":

@@ -281,9 +281,10 @@ def with_defaults(
     Returns:
       All three, as arrays of that dtype.
     """
-    thresholds, noise, mount = as_dtype((thresholds or Thresholds(), noise or SensorNoise(), mount or Mount()), dtype)
-    noise = dataclasses.replace(noise, range_sigma=jnp.maximum(noise.range_sigma, LEAST_SIGMA))
-    return thresholds, noise, mount
+    settings = thresholds or Thresholds(), noise or SensorNoise(), mount or Mount()
+    criteria, errors, place = as_dtype(settings, dtype)
+    errors = dataclasses.replace(errors, range_sigma=jnp.maximum(errors.range_sigma, LEAST_SIGMA))
+    return criteria, errors, place
 
 
 def as_dtype(tree: Any, dtype: Any) -> Any:

@@ -38,6 +38,25 @@ GRID = "#E6E6E6"
 UNCERTAIN = "#E69F00"  # the orange of Okabe and Ito
 ROBOT = "#8A8A8A"
 BLUES = ListedColormap(mpl.colormaps["Blues"](np.linspace(0.45, 1.0, 256)))
+STYLE = {
+    "axes.axisbelow": True,
+    "axes.edgecolor": "#BDBDBD",
+    "axes.grid": True,
+    "axes.labelcolor": INK,
+    "axes.titlelocation": "left",
+    "axes.titlesize": 10,
+    "figure.constrained_layout.use": True,
+    "figure.dpi": 90,
+    "font.size": 9,
+    "grid.color": GRID,
+    "grid.linewidth": 0.5,
+    "legend.frameon": False,
+    "xtick.color": SOFT,
+    "xtick.major.size": 0,
+    "ytick.color": SOFT,
+    "ytick.major.size": 0,
+}
+"""Diagrams that go with the maps, in notebooks: `plt.style.use(STYLE)`."""
 
 
 def plot_map(
@@ -86,6 +105,7 @@ def draw_map(line_map: LineMap, trajectory: ArrayLike | None = None, *, title: s
     colour = ScalarMappable(LogNorm(1, most), BLUES)
 
     figure = Figure(facecolor="white")
+    figure.set_layout_engine("none")  # laid out below, whatever the style asks for
     FigureCanvasAgg(figure)
     axes = _draw_frame(figure, frame)
     legend: list[list[Any]] = []

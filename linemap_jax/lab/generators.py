@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from linemap_jax.core.frames import unit
 from linemap_jax.core.settings import Number
-from linemap_jax.lab.world import NEVER, Kind, Time, World, box, join, moved, poles, polygon, rectangle
+from linemap_jax.lab.world import Kind, World, box, join, moved, poles, polygon, rectangle
 
 _BUMPS = 4  # waves around a free room: it looks neither round nor torn
 _WALL = 0.12  # m, thickness of inner walls
@@ -232,24 +232,31 @@ def changing_room(key: Array, *, scans: int, dtype: Any = None) -> World:
     return join(hall, *things, put(4, 3, vanishes=when[2]), poles(center[5:], 0.1))
 
 
-def laboratory(key: Array, *, jitter: Number = 0.1, change: Time = NEVER, dtype: Any = None) -> World:
+def laboratory(key: Array, *, scans: int, jitter: Number = 0.1, dtype: Any = None) -> World:
     """A cluttered laboratory of 18 m by 12 m and its corridor: the kind of world of the paper's figure 6.
 
     73 segments and 24 poles: walls, a partition, two doors, cupboards, benches, desks, the legs of tables, stools and
-    columns. At `change` a box that stood in the way is carried off, and the west door, closed until then, is opened.
-    (0, 0) is the south-west corner of the laboratory; x points east. The path goes all around, out of one door and back
-    in by the other, after the change.
+    columns. Halfway through a drive of so many scans, a box that stood in the way is carried off, and the west door,
+    closed until then, is opened. (0, 0) is the south-west corner of the laboratory; x points east. The path goes all
+    around, out of one door and, at three quarters of it, back in by the other and over the place of the box: without
+    the change it would not be free.
 
     Args:
       key: of where exactly the furniture stands.
+      scans: of the drive; of one scan, the first, box and door are as they were before.
       jitter: furniture is off its place by up to this, m, and turned by up to half as many radians; up to 0.1 the path
         stays free. 0: all of it stands where it is drawn below.
-      change: scan index at which box and door have changed.
       dtype: of the world; jax's default unless given.
 
     Returns:
       The world.
+
+    Raises:
+      ValueError: if there is no scan.
     """
+    if scans < 1:
+        raise ValueError(f"a drive has one scan at least, not {scans}")
+    change = (scans + 1) // 2  # never before the first scan: what vanishes must have been there
     dtype = _float(dtype)
     furniture = len(_BOXES) + len(_DESKS) + len(_TABLES) + len(_COLUMNS) + 1
     off = jitter * jax.random.uniform(key, (furniture, 3), dtype, -1.0, 1.0)

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from linemap_jax.core.state import Circles, LineMap, Lines, empty_circles, empty_lines
 from linemap_jax.io.atomic import OutputError
-from linemap_jax.io.plot import draw_map, plot_map
+from linemap_jax.io.plot import STYLE, draw_map, plot_map
 from linemap_jax.io.shapes import ellipses, line_bands
 
 
@@ -225,6 +225,16 @@ def test_leaves_the_settings_of_matplotlib_alone() -> None:
     before = dict(mpl.rcParams)
     draw_map(some_map(), title="a map")
     assert dict(mpl.rcParams) == before
+
+
+def test_a_map_is_laid_out_alike_within_the_style_of_diagrams() -> None:
+    with mpl.rc_context(STYLE):
+        within = draw_map(some_map(), title="a map")
+    assert within.get_layout_engine() is None
+    plain = draw_map(some_map(), title="a map")
+    np.testing.assert_array_equal(within.get_size_inches(), plain.get_size_inches())
+    for mine, other in zip(within.axes, plain.axes, strict=True):
+        np.testing.assert_array_equal(mine.get_position().bounds, other.get_position().bounds)
 
 
 def test_pyplot_is_not_loaded_and_the_package_loads_no_matplotlib() -> None:

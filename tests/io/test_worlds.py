@@ -20,7 +20,7 @@ KEY = jax.random.key(0)
 WORLDS: dict[str, Callable[[Any], World]] = {
     "room": lambda dtype: room(jnp.asarray(6.1, dtype), 4.2, 0.3),
     "changing": lambda dtype: changing_room(KEY, scans=100, dtype=dtype),
-    "laboratory": lambda dtype: laboratory(KEY, change=150, dtype=dtype),
+    "laboratory": lambda dtype: laboratory(KEY, scans=300, dtype=dtype),
     "nothing": lambda dtype: poles(jnp.zeros((0, 2), dtype), 1.0),
 }
 

@@ -22,7 +22,7 @@ CAPACITY = Capacity(16, 16)
 
 @pytest.fixture(scope="module")
 def drive() -> Simulation:
-    world = generators.laboratory(jax.random.key(3))
+    world = generators.laboratory(jax.random.key(3), scans=SCANS)
     run = jax.jit(simulate, static_argnames="count")
     return run(jax.random.key(0), world, SCANNER, count=SCANS, cov_pose=jnp.diag(jnp.asarray(POSE_SIGMA) ** 2))
 

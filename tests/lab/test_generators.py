@@ -29,7 +29,7 @@ RANDOM: dict[str, tuple[Callable[..., World], int, int]] = {  # generator, segme
     "long hall": (lambda key, **o: rectilinear_room(key, vertices=180, **o), 180, 0),
     "corridor": (lambda key, **o: corridor(key, rooms=3, **o), 52, 0),
     "changing": (lambda key, **o: changing_room(key, scans=SCANS, **o), 24, 1),
-    "laboratory": (lambda key, **o: laboratory(key, change=SCANS // 2, **o), 73, 24),
+    "laboratory": (lambda key, **o: laboratory(key, scans=SCANS, **o), 73, 24),
 }
 
 
@@ -157,10 +157,26 @@ def test_things_change_in_a_changing_room(batch: Any) -> None:
         assert SCANS // 4 <= time < SCANS * 3 // 4
 
 
+@pytest.mark.parametrize("scans", [1, 60, 301, 1000])
+def test_a_laboratory_can_be_driven_through_in_any_number_of_scans(scans: int) -> None:
+    world = laboratory(KEYS[0], scans=scans)
+    check(world, drive(world.path, count=scans, turns="smooth"), clearance=0.25)
+
+
+def test_a_laboratory_changes_within_the_drive() -> None:
+    segments = laboratory(KEYS[0], scans=601).segments
+    vanishes = np.asarray(segments.vanishes)
+    assert sorted(set(vanishes.tolist())) == [301, NEVER]
+    assert (vanishes == 301).sum() == 5  # the box and the shut door
+    np.testing.assert_array_equal(np.flatnonzero(segments.appears), np.flatnonzero(segments.appears == 301))
+    with pytest.raises(ValueError, match="a drive has one scan at least, not 0"):
+        laboratory(KEYS[0], scans=0)
+
+
 def test_a_laboratory_without_jitter_is_as_drawn() -> None:
-    worlds = [laboratory(key, jitter=0.0, change=7) for key in KEYS[:2]]
+    worlds = [laboratory(key, scans=SCANS, jitter=0.0) for key in KEYS[:2]]
     jax.tree.map(np.testing.assert_array_equal, *worlds)
-    moved = laboratory(KEYS[0], jitter=0.1, change=7)
+    moved = laboratory(KEYS[0], scans=SCANS, jitter=0.1)
     off = np.abs(np.asarray(moved.poles.center - worlds[0].poles.center))
     assert 0.02 < off.max() < 0.2
     for field in dataclasses.fields(moved.segments):

@@ -194,7 +194,7 @@ def adjust(graph: PoseGraph, lines: Lines, sightings: LineSightings) -> Adjusted
             pull_lines=jnp.zeros((k, 2), poses.dtype).at[slot].add(-_mtv(of_line, off)),
             seen=seen,
             misfit=jnp.sum(weight * square),
-            count=2 * jnp.sum(weight),
+            residuals=2 * jnp.sum(weight),
         )
 
     def iterate(at: tuple[Array, Array], widening: Array) -> tuple[tuple[Array, Array], None]:
@@ -211,7 +211,7 @@ def adjust(graph: PoseGraph, lines: Lines, sightings: LineSightings) -> Adjusted
     factor, through = _eliminated(now)
     cov = cho_solve(factor, jnp.eye(3 * n, dtype=poses.dtype))
     unknowns = 3 * jnp.sum(linked) + 2 * jnp.sum(now.seen)
-    redundancy = now.count - unknowns + jnp.sum(cov * now.of_steps)
+    redundancy = now.residuals - unknowns + jnp.sum(cov * now.of_steps)
     unit_variance = now.misfit / jnp.maximum(redundancy, 1)
     scale = jnp.maximum(unit_variance, 1)
     cov = scale * cov
@@ -283,7 +283,7 @@ class _System(NamedTuple):
     pull_lines: Float[Array, "K 2"]
     seen: Bool[Array, " K"]
     misfit: Float[Array, ""]  # chi-square of the sightings
-    count: Float[Array, ""]  # of their residuals
+    residuals: Float[Array, ""]  # how many
 
 
 def _eliminated(system: _System) -> tuple[Any, Float[Array, "P K 2"]]:
