@@ -657,6 +657,13 @@ def test_a_bag_gives_the_map_of_the_carmen_log(run, log, tmp_path):
         np.testing.assert_allclose(a["cov"], b["cov"], atol=1e-6)
 
 
+def test_a_map_on_which_few_returns_lie_is_told(run, log, tmp_path, monkeypatch):
+    for share, told in ((0.61, ""), (0.41, f"linemap: warning: {log}: only 41% of its returns lie on the map: do its")):
+        monkeypatch.setattr("linemap_jax.lab.evaluation.explained_share", lambda *_, share=share, **__: share)
+        status, _, err = run("build", log, "-o", tmp_path / str(share))
+        assert (status, err[: len(told) or None]) == (0, told)
+
+
 def test_a_bag_without_poses_can_be_extracted_but_not_mapped(run, refuse, tmp_path):
     recording = bag_of(drive())
     recording.messages = [message for message in recording.messages if message[0] != "/odom"]

@@ -174,6 +174,9 @@ def agreement(a: LineMap, b: LineMap) -> Agreement:
     Args:
       a: a map.
       b: another one.
+
+    Returns:
+      The two lengths, each the mean of both maps; both zero where no line is near one of the other map.
     """
     walls = [_Walls(*map(np.asarray, _walls(m.lines))) for m in (a, b)]
     one, other = _lengths_beside(*walls), _lengths_beside(*walls[::-1])
