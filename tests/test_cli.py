@@ -657,6 +657,13 @@ def test_a_bag_gives_the_map_of_the_carmen_log(run, log, tmp_path):
         np.testing.assert_allclose(a["cov"], b["cov"], atol=1e-6)
 
 
+def test_a_map_on_which_few_returns_lie_is_told(run, log, tmp_path, monkeypatch):
+    for share, told in ((0.61, ""), (0.41, f"linemap: warning: {log}: only 41% of its returns lie on the map: do its")):
+        monkeypatch.setattr("linemap_jax.lab.evaluation.explained_share", lambda *_, share=share, **__: share)
+        status, _, err = run("build", log, "-o", tmp_path / str(share))
+        assert (status, err[: len(told) or None]) == (0, told)
+
+
 def test_a_bag_without_poses_can_be_extracted_but_not_mapped(run, refuse, tmp_path):
     recording = bag_of(drive())
     recording.messages = [message for message in recording.messages if message[0] != "/odom"]
@@ -710,13 +717,15 @@ def test_info_of_a_bag_with_two_scanners_tells_of_both(run, tmp_path):
     assert status == 0
     assert "would refuse it: it holds the scans of several scanners, choose one by --scan-topic: /rear (1)," in out
     assert "with --scan-topic /rear:\n  frames:   laser in base_link (static)\n  scans:    1 in 0.0 s\n" in out
-    assert "  laser on the robot: tf, laser in base_link; x 0.000 m, y 0.000 m, yaw 17.2 degrees\n" in out
+    assert "  laser on the robot: tf, laser in base_link; x 0.000 m, y 0.000 m, yaw 0.0 degrees\n" in out
     assert (
         f"  next:     linemap slam {bag} -o my-map --scan-topic /rear (the poses are odometry's, which drifts)\n" in out
     )
     told = json.loads(run("info", bag, "--json")[1])
     assert {topic: of["scans"] for topic, of in told["scanners"].items()} == {"/rear": 1, "/scan": 3}
-    assert told["scanners"]["/scan"]["mount_m_rad"] == pytest.approx([0, 0, 0.3])
+    assert told["scanners"]["/scan"]["mount_m_rad"] == [0, 0, 0]
+    rear = run("info", bag, "--scan-topic", "/rear", "--laser-offset", 0.2, -0.1, 0.3)[1]
+    assert "\nlaser on the robot: given; x 0.200 m, y -0.100 m, yaw 17.2 degrees\n" in rear
     assert json.loads(run("info", bag, "--json", "--scan-topic", "/rear")[1])["beams"] == 5
 
 

@@ -51,7 +51,7 @@ class Localize(LogOptions):
         options: dict[str, Any] = options_of_update(self)
         del options["persistence"]
         _check(self)
-        from linemap_jax.io.map_file import MapFileError, read_map
+        from linemap_jax.io.map_file import MapFileError, map_in, read_map
         from linemap_jax.io.plot import plot_map
         from linemap_jax.io.tum import write_covariances, write_tum
 
@@ -63,7 +63,8 @@ class Localize(LogOptions):
         try:
             line_map, _ = read_map(self.map, dtype=self.dtype)
         except MapFileError as error:
-            if self.log.suffix in (".json", ".geojson") and self.map.exists():
+            swapped = map_in(self.log)
+            if self.map.exists() and swapped.exists() and swapped.suffix in (".json", ".geojson"):
                 raise UsageError(f"{error}; the map comes first, then the log") from error
             raise
         if not line_map.lines.valid.any():

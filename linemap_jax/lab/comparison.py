@@ -160,14 +160,23 @@ def compare_maps(
 class Agreement(NamedTuple):
     """How far two maps are of one place in one frame."""
 
-    overlap: float  # m, of lines within `REACH` of a line of the other map, the mean of both maps
-    agreeing: float  # m, of lines that lie along one of the other map, within `BESIDE` and `FARTHEST_TURN`
+    overlap: float
+    """Length of lines within `REACH` of a line of the other map, m; the mean of both maps."""
+    agreeing: float
+    """Length of lines that lie along one of the other map, within `BESIDE` and `FARTHEST_TURN`, m; the mean of both."""
 
 
 def agreement(a: LineMap, b: LineMap) -> Agreement:
     """What length of the lines of two maps lies where the other one has lines, and what of it lies along one.
 
-    Of maps of one place most of the one does, covariances apart; of maps in different frames a few per cent, by chance.
+    Of maps of one place most of the one does; of maps in different frames a few per cent, by chance.
+
+    Args:
+      a: a map.
+      b: another one.
+
+    Returns:
+      The two lengths, each the mean of both maps; both zero where no line is near one of the other map.
     """
     walls = [_Walls(*map(np.asarray, _walls(m.lines))) for m in (a, b)]
     one, other = _lengths_beside(*walls), _lengths_beside(*walls[::-1])
