@@ -240,7 +240,7 @@ def _stretches(sample: Sample) -> Row:
     )
 
     @jax.jit
-    def cut(lines: Lines) -> tuple[wiping.Stretches, Any, Any]:
+    def cut(lines: Lines) -> tuple[Any, Any, Any]:
         slots = jnp.arange(count, dtype=jnp.int32)
         found = jax.vmap(lambda line, slot: wiping.inside_triangles(line, slot, triangles))(lines, slots)
         return found, lines.anchor + lines.offset[:, None] * lines.normal, lines.tangent
