@@ -16,6 +16,7 @@ from linemap_jax.lab.verification import Row, as_markdown, as_text, citations, v
 
 ROOT = Path(__file__).resolve().parents[1]
 OF_ALL = "test_verification::test_equation"
+NAMES = {ast.Name: "id", ast.Attribute: "attr", ast.arg: "arg"}
 
 
 def main() -> int:
@@ -44,25 +45,26 @@ def part_of_readme(rows: Iterable[Row]) -> str:
 def tests_of(name: str) -> Iterator[str]:
     """File and name of each test that names what has this name in `core`, whose modules the tests mirror.
 
-    Or that names what the file makes of it outside of any function, such as the same function compiled.
+    Or that names, or takes as a fixture, what the file makes of it: the same function compiled, or a helper around it.
+    Whole modules are tested by nobody in particular.
     """
-    module, *_, function = name.split(".")
+    module, _, function = name.partition(".")
     file = ROOT / f"tests/core/test_{module}.py"
     body = ast.parse(file.read_text(encoding="utf-8")).body if file.exists() else []
-    meant = {function}
+    tests = [item for item in body if isinstance(item, ast.FunctionDef) and item.name.startswith("test_")]
+    meant = {function.rpartition(".")[2]}
     for item in body:
         if isinstance(item, ast.Assign) and meant & names_in(item.value):
             meant |= names_in(*item.targets)
-    for item in body:
-        if isinstance(item, ast.FunctionDef) and item.name.startswith("test_") and meant & names_in(item):
-            yield f"{file.stem}::{item.name}"
+        elif isinstance(item, ast.FunctionDef) and item not in tests and meant & names_in(item):
+            meant.add(item.name)
+    yield from (f"{file.stem}::{test.name}" for test in tests if meant & names_in(test))
 
 
 def names_in(*nodes: ast.AST) -> set[str]:
-    """All names and attributes in pieces of a program."""
-    parts = [part for node in nodes for part in ast.walk(node)]
-    names = {part.id for part in parts if isinstance(part, ast.Name)}
-    return names | {part.attr for part in parts if isinstance(part, ast.Attribute)}
+    """All names, attributes and parameters in pieces of a program."""
+    parts = (part for node in nodes for part in ast.walk(node))
+    return {getattr(part, NAMES[type(part)]) for part in parts if type(part) in NAMES}
 
 
 if __name__ == "__main__":

@@ -293,6 +293,17 @@ def test_short_fragments_go_too() -> None:
     assert (int(report.deleted), int(report.trimmed)) == (0, 1)
 
 
+def test_a_thing_that_was_seen_anew_is_not_gone_though_beams_passed_where_it_was() -> None:
+    ranges = np.where(np.abs(BEARINGS) < np.radians(1.5), 2.25, WALL)
+    seen = dataclasses.replace(circle_at(2.0, 0.0), times_detected=jnp.ones(1, jnp.int32))
+    after, report = updated(lines_of(([9.0, -0.8], [9.0, 0.8])), ranges, seen)
+    assert (int(report.deleted), bool(after.circles.valid[0]), int(after.circles.times_detected[0])) == (0, True, 2)
+    np.testing.assert_allclose(after.circles.center[0], [2.125, 0.0], atol=1e-3)
+    # Nothing is there any more.
+    after, report = updated(lines_of(([9.0, -0.8], [9.0, 0.8])), WALL, seen)
+    assert (int(report.deleted), bool(after.circles.valid[0])) == (1, False)
+
+
 @pytest.mark.parametrize(("own", "gone"), [(0, False), (1, True), (-1, True)])
 def test_beams_never_wipe_the_line_that_they_measure(own: int, gone: bool) -> None:
     found = lines_of(([3.0, -3.0], [3.0, 3.0]), capacity=1)
