@@ -64,7 +64,7 @@ from linemap_jax.core.state import (
     Status,
 )
 
-__version__ = "0.1.0.dev0"
+__version__ = "0.1.0"
 
 __all__ = [
     "Scan",
