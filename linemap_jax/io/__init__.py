@@ -22,6 +22,7 @@ Maps, and what is drawn of them:
 And beneath:
 
   atomic          files that are there in full or not at all
+  json_file       JSON from a file, or what is wrong with it
   thinned         a long stream in a short list
   programs        compiled programs, kept on the disk
 """
