@@ -246,9 +246,9 @@ def with_defaults(
     thresholds: Thresholds | None, noise: SensorNoise | None, mount: Mount | None, dtype: Any
 ) -> tuple[Thresholds, SensorNoise, Mount]:
     """The settings as arrays of one dtype, the defaults where none are given."""
-    thresholds, noise, mount = as_dtype((thresholds or Thresholds(), noise or SensorNoise(), mount or Mount()), dtype)
-    noise = dataclasses.replace(noise, range_sigma=jnp.maximum(noise.range_sigma, LEAST_SIGMA))
-    return thresholds, noise, mount
+    settings = (thresholds or Thresholds(), noise or SensorNoise(), mount or Mount())
+    gates, sigmas, at = as_dtype(settings, dtype)
+    return gates, dataclasses.replace(sigmas, range_sigma=jnp.maximum(sigmas.range_sigma, LEAST_SIGMA)), at
 
 
 def as_dtype(tree: Any, dtype: Any) -> Any:
