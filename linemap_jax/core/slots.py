@@ -120,7 +120,7 @@ LARGEST = 1e9
 
 
 def bounded(slots: SlotsT) -> Bool[Array, " K"]:
-    """The lines or circles whose numbers are all finite, and none beyond `LARGEST`."""
+    """Which of the lines or circles in `slots` hold finite numbers alone, and none beyond `LARGEST`."""
     return jnp.all(jnp.abs(_packed(slots)[0]) <= LARGEST, 0)
 
 
