@@ -34,6 +34,18 @@ THINNING = 3
 """Every n-th point takes part in the search."""
 HYPOTHESES = 10
 """Poses that are registered."""
+FARTHEST = 9.0
+"""Squared distance from the guess, in sigmas, up to which poses are looked at."""
+PREFERENCE = 0.02
+"""Share of the points that such a squared sigma is worth: of two poses that count alike, the nearer one."""
+ONE_PEAK = 3, 2
+"""Cells and directions about a pose that belong to the same peak of the count."""
+LEAST_COUNT = 0.3
+"""Share of the points that must fall on the surface for a pose to be a hypothesis."""
+HARDLY_ANYTHING = 0.04, 0.04, 1.0
+"""1/m^2, 1/m^2, 1/rad^2. Information of a guess of 5 m and a radian: the points are to say where they lie."""
+WEIGHT_OF_DRIFT = 1e-3
+"""Of the information that drift leaves, beside the points, which err alike where they are neighbours."""
 
 
 @pytree
@@ -95,11 +107,6 @@ def joined(surfaces: Surface, poses: Float[Array, "S 3"], valid: Bool[Array, " S
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), jax.vmap(moved)(surfaces, poses, valid))
 
 
-def thinned(surface: Surface) -> Surface:
-    """Every third point of the `surface`."""
-    return jax.tree.map(lambda x: x[::THINNING], surface)
-
-
 def close_loop(
     new: Surface,
     surfaces: Surface,
@@ -130,16 +137,16 @@ def close_loop(
     turn_drift = settings.least_turn_drift + settings.turn_drift_per_metre * path
 
     def near(_: None) -> Closure:
-        prior = jnp.diag(jnp.asarray([0.04, 0.04, 1.0], guess.dtype))  # nearly nothing: the points are to say it
+        prior = jnp.diag(jnp.asarray(HARDLY_ANYTHING, guess.dtype))
         found = register(new, surface, guess, prior, registration, iterations=15)
         return Closure(*found, believed=found.share >= settings.share_near)
 
     def far(_: None) -> Closure:
-        prior = jnp.diag(jnp.stack([1 / drift**2, 1 / drift**2, 1 / turn_drift**2])) * 1e-3
-        few = thinned(new)
-        starts, score = search(few, surface, guess, drift, turn_drift)
+        prior = jnp.diag(jnp.stack([1 / drift**2, 1 / drift**2, 1 / turn_drift**2])) * WEIGHT_OF_DRIFT
+        few = jax.tree.map(lambda x: x[::THINNING], new)
+        starts, score = correlate(few, surface, guess, drift, turn_drift)
         found = jax.vmap(lambda start: register(few, surface, start, prior, registration))(starts)
-        share = jnp.where(score > 0.3, found.share, 0)
+        share = jnp.where(score > LEAST_COUNT, found.share, 0)
         best = jnp.argmax(share)
         off = found.pose - found.pose[best][None]
         other = jnp.abs(wrap_angle(off[:, 2])) > settings.turned_apart
@@ -152,7 +159,7 @@ def close_loop(
     return jax.lax.cond(drift > settings.search_from, far, near, None)
 
 
-def search(
+def correlate(
     new: Surface,
     surface: Surface,
     guess: Float[Array, "3"],
@@ -165,7 +172,7 @@ def search(
       new: the one, in its own frame.
       surface: the other, in the frame of the pose; drawn within 30 m of the origin.
       guess: the pose. m, m, rad.
-      drift: standard deviation of its position, m; what is three of them away is left out.
+      drift: standard deviation of its position, m; what is farther than `FARTHEST` is left out.
       turn_drift: of its direction, rad.
 
     Returns:
@@ -187,14 +194,16 @@ def search(
 
     score = jax.lax.map(count, turns) / jnp.maximum(jnp.sum(new.valid), 1).astype(guess.dtype)
     far = (moves[None, :, None] ** 2 + moves[None, None] ** 2) / drift**2 + (turns[:, None, None] / turn_drift) ** 2
-    near: Array = score - 0.02 * far
-    liked = jnp.where(far > 9, jnp.full_like(near, -1), near)  # of two that count alike, the nearer one
+    near: Array = score - PREFERENCE * far
+    liked = jnp.where(far > FARTHEST, jnp.full_like(near, -1), near)  # of two that count alike, the nearer one
 
     def pick(liked: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
         best = jnp.unravel_index(jnp.argmax(liked), liked.shape)
         pose = guess + jnp.stack([moves[best[1]], moves[best[2]], turns[best[0]]])
-        away = (jnp.abs(window - window[best[1]])[:, None] > 3) | (jnp.abs(window - window[best[2]])[None] > 3)
-        away = away[None] | (jnp.abs(jnp.arange(turns.size) - best[0]) > 2)[:, None, None]
+        away = (jnp.abs(window - window[best[1]])[:, None] > ONE_PEAK[0]) | (
+            jnp.abs(window - window[best[2]])[None] > ONE_PEAK[0]
+        )
+        away = away[None] | (jnp.abs(jnp.arange(turns.size) - best[0]) > ONE_PEAK[1])[:, None, None]
         return jnp.where(away, liked, -2), (pose, score[best])
 
     return jax.lax.scan(pick, liked, None, length=HYPOTHESES)[1]
