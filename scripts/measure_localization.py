@@ -26,7 +26,8 @@ from readme import write_part
 from linemap_jax.cli import main as linemap
 from linemap_jax.io.carmen import assumed_sweep
 from linemap_jax.io.carmen_writer import write_carmen
-from linemap_jax.io.log import RANGE_MAX, open_log
+from linemap_jax.io.log import open_log
+from linemap_jax.io.reading import RANGE_MAX
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("LINEMAP_DATA", ROOT / "../shared/data"))

@@ -33,8 +33,9 @@ from linemap_jax.core.settings import Persistence, Rules, SensorNoise, Threshold
 from linemap_jax.io.config import SECTIONS, ConfigError, config_text, read_config
 from linemap_jax.io.exports import FORMATS, LOG_NEEDED, Content
 from linemap_jax.io.frames import Standstill
-from linemap_jax.io.log import LogError, open_log
+from linemap_jax.io.log import open_log
 from linemap_jax.io.map_file import MapFileError, read_map, write_map
+from linemap_jax.io.reading import LogError
 from linemap_jax.io.scans import chunks_of_readings
 from linemap_jax.io.survey import describe
 from linemap_jax.io.table import ResultsTable, TableError

@@ -4,7 +4,8 @@ from typing import Any
 
 import pytest
 
-from linemap_jax.io.log import LogError, Notes, Reading, open_log
+from linemap_jax.io.log import open_log
+from linemap_jax.io.reading import LogError, Notes, Reading
 
 
 def read(path: Any, **options: Any) -> tuple[list[Reading], Notes]:

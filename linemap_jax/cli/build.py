@@ -20,7 +20,7 @@ from linemap_jax.cli.resume import differences, map_to_resume
 
 if TYPE_CHECKING:
     from linemap_jax.core.state import LineMap, Pose, Report, Scan
-    from linemap_jax.io.log import Log
+    from linemap_jax.io.reading import Log
 
 DEMO_NOISE = {"range_sigma": 0.015, "bearing_sigma": 0.0005, "pose_sigma": (0.01, 0.01, 0.002)}
 """What the demo log was made with."""

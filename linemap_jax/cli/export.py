@@ -13,7 +13,7 @@ from linemap_jax.cli.options import LogInput, UsageError, check_input
 from linemap_jax.cli.output import check_output, make_folder, say
 
 if TYPE_CHECKING:
-    from linemap_jax.io.log import Log
+    from linemap_jax.io.reading import Log
 
 FormatName = Literal["json", "geojson", "svg", "dxf", "nav2", "mcap", "tum", "png", "html"]
 """What `--to` offers: the names of `linemap_jax.io.exports.FORMATS`, which is not loaded to print a help text."""

@@ -11,7 +11,7 @@ from linemap_jax.cli.output import say
 if TYPE_CHECKING:
     from linemap_jax.core.settings import Mount
     from linemap_jax.core.state import LineMap, Pose, Scan
-    from linemap_jax.io.log import Log
+    from linemap_jax.io.reading import Log
 
 FEW = 0.5
 """Share of the returns under 20 m that lie within 10 cm of a map. Of the drive that made it two thirds and more do; in

@@ -48,7 +48,7 @@ class Info(LogInput):
         topics = told.pop("scan_topics")
         if self.scan_topic is None and len(topics) > 1:
             told["scanners"] = {topic: _of_scanner(_told(self, topic)) for topic in topics}
-        from linemap_jax.io.log import printable
+        from linemap_jax.io.reading import printable
 
         words = json.dumps(told, indent=2, allow_nan=False) if self.json else "\n".join(map(printable, _in_words(told)))
         print(words)
@@ -57,7 +57,7 @@ class Info(LogInput):
 
 def _told(command: Info, scan_topic: str | None) -> dict[str, Any]:
     """What the log holds; and, whether or not that is of a scan topic, what `build` would make of its poses."""
-    from linemap_jax.io.log import LogError
+    from linemap_jax.io.reading import LogError
     from linemap_jax.io.survey import describe
 
     chosen = dataclasses.replace(command, scan_topic=scan_topic)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from linemap_jax.core.state import LineMap
-    from linemap_jax.io.log import Log
+    from linemap_jax.io.reading import Log
 
 CHUNK = 64
 """Scans in one jitted call."""
@@ -182,7 +182,7 @@ def _steps(
     import numpy as np
 
     from linemap_jax.core.frames_on_host import between
-    from linemap_jax.io.log import MAX_GAP
+    from linemap_jax.io.reading import MAX_GAP
 
     places = np.concatenate([last[0][None], poses])
     steps = between(places[:-1], places[1:])

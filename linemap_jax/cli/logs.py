@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from linemap_jax.core.settings import Mount
     from linemap_jax.core.state import Pose, Scan
-    from linemap_jax.io.log import Log
+    from linemap_jax.io.reading import Log
     from linemap_jax.io.scans import Chunk
 
 SCANS_EXPLAINED = 250

@@ -81,8 +81,8 @@ def main(args: list[str] | None = None) -> int:
     # What follows loads jax, which takes a second: not before the options are known to be right.
     from linemap_jax.io.atomic import OutputError
     from linemap_jax.io.config import ConfigError
-    from linemap_jax.io.log import LogError
     from linemap_jax.io.map_file import MapFileError
+    from linemap_jax.io.reading import LogError
     from linemap_jax.io.table import TableError
     from linemap_jax.io.worlds import WorldFileError
 

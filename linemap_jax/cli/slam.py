@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from linemap_jax.core.settings import Mount
     from linemap_jax.core.state import LineMap, Pose, Scan
-    from linemap_jax.io.log import Log
+    from linemap_jax.io.reading import Log
     from linemap_jax.slam import Slam as Slammed
 
 DOUBTFUL = 0.4

@@ -2,7 +2,8 @@
 
 Logs, and what is read with them:
 
-  log             laser scans of any format, as a stream of `Reading`s
+  reading         what a log is: a stream of `Reading`s, and notes about what was odd
+  log             opens one, whatever its format
   carmen          CARMEN logs; `carmen_writer` writes them
   bags            ROS bags; `bag_file` opens one, `frames` knows where frames were over time
   tum             trajectories, read and written

@@ -40,7 +40,7 @@ from linemap_jax.io.frames import (
     transform_of,
     upright,
 )
-from linemap_jax.io.log import RANGE_MAX, LogError, Notes, Options, Progress, Reading
+from linemap_jax.io.reading import RANGE_MAX, LogError, Notes, Options, Progress, Reading
 
 MAX_WAIT = 5.0
 """s. A scan waits so long, by the time of recording, for the poses that it needs."""
@@ -73,7 +73,7 @@ _MOVED = 1e-3  # m, and rad: the laser sits somewhere else on the robot
 
 
 class BagLog:
-    """A ROS bag, with the interface of `linemap_jax.io.log.Log`.
+    """A ROS bag, with the interface of `linemap_jax.io.reading.Log`.
 
     A malformed scan (one that cannot be taken apart, has no ranges, or angles that are not finite) is skipped and
     counted; a `strict` reader refuses it. Scans for whose time no pose is known are left out and counted, unless poses

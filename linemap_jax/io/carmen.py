@@ -34,7 +34,7 @@ from pathlib import Path
 import numpy as np
 
 from linemap_jax.io.frames import poses_of_sweep
-from linemap_jax.io.log import RANGE_MAX, LogError, Notes, Options, Progress, Reading
+from linemap_jax.io.reading import RANGE_MAX, LogError, Notes, Options, Progress, Reading
 
 MAX_LINE = 1 << 20
 """Bytes. A longer line is no message (1 MiB holds some hundred thousand ranges) and is never held in memory."""
@@ -84,7 +84,7 @@ class _Fault(Exception):
 
 
 class CarmenLog:
-    """A CARMEN log, with the interface of `linemap_jax.io.log.Log`.
+    """A CARMEN log, with the interface of `linemap_jax.io.reading.Log`.
 
     A malformed line (a pose or time stamp that is not finite, a field that is not a number, too few or too many
     fields, no ranges at all, another number of beams than the first scan) is skipped and counted in the notes; a

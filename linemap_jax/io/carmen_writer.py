@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from linemap_jax.io.atomic import atomic_write
 from linemap_jax.io.carmen import assumed_sweep
-from linemap_jax.io.log import RANGE_MAX
+from linemap_jax.io.reading import RANGE_MAX
 
 NO_RETURN = 81.91
 """m, what scanners report in `FLASER` messages where nothing was seen."""

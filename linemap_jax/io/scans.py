@@ -15,7 +15,7 @@ import numpy as np
 
 from linemap_jax.core.state import Pose, Scan
 from linemap_jax.core.sweep import close_sweep
-from linemap_jax.io.log import Reading
+from linemap_jax.io.reading import Reading
 
 _WIDTHS = 64  # Beams are filled up to a multiple of this where their number varies: each width is compiled anew.
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from linemap_jax.io.log import Log, LogError, Reading
+from linemap_jax.io.reading import Log, LogError, Reading
 
 SHARES = ("returns", "plus_inf", "too_far", "too_near", "minus_inf", "nan")
 """What a beam may have brought back: a return; no return, as infinity or as a range from the maximum on; a range of

@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from linemap_jax.io.atomic import atomic_write
-from linemap_jax.io.log import printable
+from linemap_jax.io.reading import printable
 
 Columns = Mapping[str, NDArray[Any]]
 """Name -> values; the first axis counts the rows."""

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from linemap_jax.io.atomic import atomic_write
 from linemap_jax.io.frames import Trajectory, planar, transform_of
-from linemap_jax.io.log import LogError
+from linemap_jax.io.reading import LogError
 
 _WHOSE = re.compile(r"#\s*poses of the (robot|laser)\b")
 """The comment by which a trajectory says whose poses it holds."""

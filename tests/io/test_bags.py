@@ -13,7 +13,8 @@ from logs import read, refused
 
 from linemap_jax.io.bags import MAX_WAIT, covariance_in_the_plane
 from linemap_jax.io.frames import Standstill, Trajectory
-from linemap_jax.io.log import RANGE_MAX, LogError, open_log
+from linemap_jax.io.log import open_log
+from linemap_jax.io.reading import RANGE_MAX, LogError
 
 KINDS = ["bag", "bag-lz4", "bag-bz2", "db3", "db3-zstd", "mcap", "mcap-zstd"]
 RANGES = [1.0, 2.0, 3.0, math.inf, -math.inf, math.nan, 0.0]

@@ -14,7 +14,8 @@ from logs import read, refused
 
 from linemap_jax.io.carmen import MAX_LINE, assumed_sweep
 from linemap_jax.io.frames import Trajectory
-from linemap_jax.io.log import RANGE_MAX, LogError, Notes, open_log
+from linemap_jax.io.log import open_log
+from linemap_jax.io.reading import RANGE_MAX, LogError, Notes
 
 DATA = Path(os.environ.get("LINEMAP_DATA", Path(__file__).parents[2] / "../shared/data")) / "carmen"
 POSE = (1.0, 2.0, 0.5)

@@ -10,7 +10,8 @@ import pytest
 
 from linemap_jax.io.atomic import OutputError
 from linemap_jax.io.carmen_writer import write_carmen
-from linemap_jax.io.log import Reading, open_log
+from linemap_jax.io.log import open_log
+from linemap_jax.io.reading import Reading
 from linemap_jax.io.tum import write_tum
 
 HALF_TURN = np.radians(np.arange(361) / 2 - 90)

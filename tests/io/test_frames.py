@@ -19,7 +19,7 @@ from linemap_jax.io.frames import (
     transform_of,
     upright,
 )
-from linemap_jax.io.log import LogError
+from linemap_jax.io.reading import LogError
 from linemap_jax.io.tum import read_tum, write_tum
 
 

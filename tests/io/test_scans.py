@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from linemap_jax.core.state import Scan
-from linemap_jax.io.log import Reading
+from linemap_jax.io.reading import Reading
 from linemap_jax.io.scans import at_first_beam, chunks_of_readings
 
 COV = np.diag([0.1, 0.2, 0.3])
