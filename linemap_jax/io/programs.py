@@ -15,7 +15,6 @@ import jax
 import jax.numpy as jnp
 from jax import export
 
-import linemap_jax
 from linemap_jax.io.atomic import OutputError, atomic_write
 
 MOST_KEPT = 32
@@ -84,7 +83,7 @@ def _load_lapack() -> None:
 @cache
 def _source() -> str:
     """A digest of the package's source: a program of other source is another program."""
-    root = Path(linemap_jax.__file__).parent
+    root = Path(__file__).parents[1]
     digest = _DIGEST()
     for file in sorted(root.rglob("*.py")):
         digest.update(str(file.relative_to(root)).encode() + b"\0" + file.read_bytes() + b"\0")
