@@ -361,8 +361,11 @@ def slam(
 
     Raises:
       TypeError: for a setting that `Slam` does not have.
+      ValueError: if there is not one pose of odometry for each scan.
     """
     state, count, places = Slam(**settings), scans.ranges.shape[0], np.asarray(odometry)
+    if places.shape != (count, 3):
+        raise ValueError(f"odometry must have one pose for each scan, shape {(count, 3)}, not {places.shape}")
     for i in range(0, count, CHUNK):
         state.add(_part(scans, i), places[i : i + CHUNK])
     poses = poses_for_map(state.trajectory(), scans.ranges.dtype)

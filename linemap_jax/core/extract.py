@@ -71,6 +71,7 @@ def extract(
       The primitives in `capacity` slots, in beam order. Between circles there may be free slots.
 
     Raises:
+      TypeError: if the pose is no `Pose`.
       ValueError: at trace time, for an option that does not exist.
     """
     _, _, found = observe(
@@ -118,7 +119,13 @@ def observe(
 
     Returns:
       The points; the pose, made finite; and what the points hold.
+
+    Raises:
+      TypeError: if the pose is no `Pose`.
+      ValueError: at trace time, for an option that does not exist.
     """
+    if not isinstance(pose, Pose):
+        raise TypeError("pose must be a Pose, with mean and covariance, not an array alone")
     scan, pose, finite = usable(scan, as_dtype(pose, scan.ranges.dtype))
     points = points_from_scan(scan, pose, mount, jacobians=jacobians)
     found = extract_points(

@@ -20,18 +20,20 @@ _BUMPS = 4  # waves around a free room: it looks neither round nor torn
 _WALL = 0.12  # m, thickness of inner walls
 
 
-def room(width: Number, depth: Number, angle: Number = 0.0) -> World:
+def room(width: Number, depth: Number, angle: Number = 0.0, *, dtype: Any = None) -> World:
     """A plain room, turned about its centre, which is the origin; the path is the centre alone.
 
     Args:
       width: along its own x axis, m.
       depth: along its own y axis, m.
       angle: of that x axis, rad.
+      dtype: of the world; unless given that of the numbers, or jax's default.
 
     Returns:
       A world of four segments.
     """
-    dtype = jnp.result_type(float, *(x for x in (width, depth, angle) if not isinstance(x, float | int)))
+    if dtype is None:
+        dtype = jnp.result_type(float, *(x for x in (width, depth, angle) if not isinstance(x, float | int)))
     center = jnp.zeros(2, dtype)
     return dataclasses.replace(box(center, width, depth, angle, kind=Kind.ROOM), path=center[None])
 

@@ -22,6 +22,7 @@ from linemap_jax.core.estimation.registration import nearest, register
 from linemap_jax.core.estimation.surface import Surface, middle_of, seen_from, surface_of_scan
 from linemap_jax.core.estimation.tracking import TrackingSettings, _cov_guess, begin_track, track
 from linemap_jax.core.state import LineMap, Lines, Scan, empty_lines
+from linemap_jax.slam import slam
 
 adjusted, optimised = jax.jit(adjust), jax.jit(optimise)
 
@@ -447,3 +448,9 @@ def test_what_a_scan_looks_at_is_the_middle_of_what_is_near() -> None:
     surface = Surface(position=position, normal=position, flat=valid, valid=valid)
     np.testing.assert_allclose(middle_of(surface), [2.0, 1.0])
     np.testing.assert_allclose(middle_of(surface, reach=0.5), [0.0, 0.0])
+
+
+def test_odometry_of_another_length_is_refused() -> None:
+    scans = jax.vmap(lambda r: Scan.from_ranges(r, jnp.asarray(BEARINGS)))(jnp.ones((3, BEARINGS.size)))
+    with pytest.raises(ValueError, match=r"one pose for each scan, shape \(3, 3\), not \(2, 3\)"):
+        slam(scans, np.zeros((2, 3)))
