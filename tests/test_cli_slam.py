@@ -97,6 +97,7 @@ def test_a_drive_around_a_block(drive: Drive, run: Callable[..., Any], tmp_path:
     assert told["explained"] > 0.9
     assert told["times_real_time"] == pytest.approx(0.25e6 * (SCANS - 1) / SCANS / told["us_per_scan"])
     assert told["us_per_scan"] > 0
+    assert found.pose_frame == "laser"
     lost = np.loadtxt(tmp_path / "out" / "trajectory.csv", delimiter=",", skiprows=1)[:, -1]
     assert lost[0] == 0  # before it there is nothing to agree with
 
@@ -151,7 +152,8 @@ def test_a_robot_that_is_carried_away(drive: Drive, run: Callable[..., Any], tmp
     drive.odometry = drive.odometry - (drive.odometry[250] - drive.odometry[40]) * (np.arange(SCANS) >= 250)[:, None]
     drive.write(tmp_path / "carried.log", kept, stamps)  # pyright: ignore[reportArgumentType]
     drive.odometry = odometry
-    status, _, err = run("slam", tmp_path / "carried.log", "-o", tmp_path / "out", "--laser-offset", 0.2, 0, 0)
+    options = "--trajectory-frame", "base", "--laser-offset", 0.2, 0, 0
+    status, _, err = run("slam", tmp_path / "carried.log", "-o", tmp_path / "out", *options)
     assert status == 0
     assert (tmp_path / "out" / "trajectory.tum").read_text().startswith("# poses of the robot: ")
     assert "1 scan came more than 60 s after" in err

@@ -36,8 +36,8 @@ class Slam(LogOptions):
     """CARMEN log, plain or .gz; ROS 1 .bag; ROS 2 bag: its folder, .mcap or .db3."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="DIR")]
     """Folder for the map and the trajectory; made if it is not there."""
-    trajectory_frame: Literal["base", "laser"] = "base"
-    """Whose poses trajectory.tum and .csv hold: the robot's, or the laser's."""
+    trajectory_frame: Literal["laser", "base"] = "laser"
+    """Whose poses trajectory.tum and .csv hold: the laser's, or the robot's."""
     json: bool = False
     """Print the summary as JSON."""
 
