@@ -374,7 +374,7 @@ def test_settings_from_a_file_are_finite_too(tmp_path: Path, sound: dict[str, An
 def test_what_cannot_be_opened(tmp_path: Path) -> None:
     with pytest.raises(MapFileError, match=r"^cannot read .*none\.json: No such file or directory$"):
         read_map(tmp_path / "none.json")
-    with pytest.raises(MapFileError, match=r"^cannot read .*: Is a directory$"):
-        read_map(tmp_path)
+    with pytest.raises(MapFileError, match=r"^cannot read .*map\.json: No such file or directory$"):
+        read_map(tmp_path)  # of a folder, the map in it
     with pytest.raises(MapFileError, match=r"^cannot write .*map\.json: the folder .* does not exist$"):
         write_map(tmp_path / "nowhere" / "map.json", random_map("float32"), {})
