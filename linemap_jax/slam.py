@@ -49,7 +49,10 @@ CLOSED = 0.3
 """m. A closure counts as a path of this length."""
 
 SIGMA_NEXT = (0.02, 0.02, 0.005)
-"""m, m, rad. How far the pose of a scan may be off against its neighbours', when lines are matched."""
+"""m, m, rad. How far the pose of a keyframe may be off against the map, when its lines are looked for there."""
+
+SIGMA_MAP = (0.05, 0.05, 0.01)
+"""m, m, rad. The same while the map is made, where two passes through a place are as far apart as their loops leave."""
 
 SIGMA_SCAN = (0.01, 0.01, 0.003)
 """m, m, rad. By how much the registration of a single scan errs."""
@@ -250,7 +253,7 @@ class Slam:
         for i in range(0, count, CHUNK):
             scans = _stacked(self._keyframes.scan[i : i + CHUNK], width)
             size = len(scans.ranges)
-            poses = poses_for_map(self._poses[i : i + CHUNK], dtype)
+            poses = _uncertain(self._poses[i : i + CHUNK], SIGMA_NEXT, dtype)
             piece = pad_stack((scans, poses, jnp.asarray(numbers[i : i + CHUNK])), CHUNK)
             seen = _jit_sightings(*piece, line_map.lines, thresholds=thresholds, noise=noise, **options)
             pieces.append(jax.tree.map(partial(_flat, size), seen))
@@ -375,7 +378,7 @@ def slam(
 
 
 def poses_for_map(trajectory: Float[np.ndarray, "T 3"], dtype: Any) -> Pose:
-    """The poses of a trajectory as a map is to be made from: as uncertain as they are against their neighbours.
+    """The poses of a trajectory as a map is to be made from: as uncertain as they are against each other.
 
     What the whole of it is uncertain by, and the map with it, comes from `Slam.adjust`.
 
@@ -386,8 +389,12 @@ def poses_for_map(trajectory: Float[np.ndarray, "T 3"], dtype: Any) -> Pose:
     Returns:
       The poses, stacked.
     """
-    cov = np.tile(np.diag(np.square(SIGMA_NEXT)), (len(trajectory), 1, 1))
-    return Pose(mean=jnp.asarray(trajectory, dtype), cov=jnp.asarray(cov, dtype))
+    return _uncertain(trajectory, SIGMA_MAP, dtype)
+
+
+def _uncertain(poses: np.ndarray, sigmas: tuple[float, float, float], dtype: Any) -> Pose:
+    cov = np.tile(np.diag(np.square(sigmas)), (len(poses), 1, 1))
+    return Pose(mean=jnp.asarray(poses, dtype), cov=jnp.asarray(cov, dtype))
 
 
 def _part(scans: Scan, begin: int) -> Scan:
