@@ -44,13 +44,20 @@ prepare() { # prepare [EXTRA]: installs the project, unless that was done with t
   elif is_installed "${extra:-base}" "$wanted" || is_installed test "$wanted"; then
     return
   fi
-  echo "Installing linemap_jax and what it needs into .venv; this takes a minute or two."
+  echo "Installing linemap_jax and what it needs into .venv; this takes a minute."
   if [[ -n "$python" ]]; then
     make_venv
   fi
-  .venv/bin/python -m pip install -qq --disable-pip-version-check --editable ".${extra:+[$extra]}" ||
-    fail "the installation did not succeed; what pip said stands above"
+  install_python --editable ".${extra:+[$extra]}" || fail "the installation did not succeed; what pip said stands above"
   echo "$wanted" >".venv/installed-${extra:-base}"
+}
+
+install_python() { # by uv, which takes a third of the time; by pip where uv does not run
+  local pip=(.venv/bin/python -m pip install -qq --disable-pip-version-check)
+  if "${pip[@]}" uv >/dev/null 2>&1 && .venv/bin/python -m uv pip install -q --python .venv/bin/python "$@" 2>/dev/null; then
+    return
+  fi
+  "${pip[@]}" "$@"
 }
 
 is_installed() { # is_installed EXTRA WANTED

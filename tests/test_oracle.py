@@ -132,10 +132,11 @@ def update_one(line_map: Any, scan: Any, pose: Any, name: Any, pose_error: Any) 
 @pytest.mark.parametrize(
     ("log", "name", "pose_error", "count"),
     [
-        ("intel", "default", "unknown", 200),
-        ("intel", "paper", "unknown", 200),
+        # Of 200 scans each scripts/compare_with_oracle.py tells.
+        ("intel", "default", "unknown", 100),
+        ("intel", "paper", "unknown", 100),
         ("freiburg-079", "default", "unknown", 200),
-        ("freiburg-079", "paper", "unknown", 200),
+        ("freiburg-079", "paper", "unknown", 100),
         ("intel", "default", "independent", 60),
         ("intel", "default", "persistent", 60),
     ],
