@@ -64,6 +64,7 @@ def extract(
       segmentation: "incremental", the paper's criteria, or "optimal", the runs that explain the points best.
       max_vertices: of "optimal": a budget of end points for the scan, 2 or more; a corner that two lines share counts
         once. The lines are then those of polylines, down to two points each, and have slots for all of the budget.
+        Their derivatives are taken forward (`jax.jacfwd`); all others in either direction.
       covariance: "exact", to first order with the pose error that all points share, or "printed", Eq. (12).
       jacobians: "analytic", the hand-derived ones, or "autodiff" through the estimate; the results are the same.
 

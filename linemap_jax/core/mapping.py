@@ -86,7 +86,8 @@ def update(
 ) -> tuple[LineMap, Report]:
     """Bring one scan into the map: extract, match, fuse or add, merge, wipe.
 
-    A scan without returns, or with a pose that is not finite, changes nothing.
+    A scan without returns, or with a pose that is not finite, changes nothing. To differentiate, go forward (`jax.jvp`,
+    `jax.jacfwd`): wiping loops for as long as there are lines to cut, and jax takes no such loop backwards.
 
     Args:
       line_map: the map so far.
