@@ -75,7 +75,8 @@ class _Keyframes:
 class Slam:
     """Simultaneous localisation and mapping, chunk by chunk.
 
-    The trajectory is given in the frame in which odometry began. Its poses are those of the scanner.
+    The trajectory is given in the frame in which odometry began. Its poses are those of the scanner. `unit_variance` is
+    what the last `adjust` found; before, it is 1.
     """
 
     def __init__(

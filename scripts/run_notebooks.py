@@ -18,7 +18,7 @@ from nbclient import NotebookClient
 from nbclient.exceptions import CellExecutionError, CellTimeoutError
 
 NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
-TIMEOUT = 600
+TIMEOUT = 300
 """Of one cell, s: several times what the longest one takes on two idle cores."""
 
 

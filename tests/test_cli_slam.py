@@ -95,6 +95,7 @@ def test_a_drive_around_a_block(drive: Drive, run: Callable[..., Any], tmp_path:
     assert np.abs(np.angle(np.exp(1j * off[:, 2]))).max() < 0.02
     assert told["loops"] > 20
     assert told["explained"] > 0.9
+    assert 0.3 < told["unit_variance"] < 3
     assert told["times_real_time"] == pytest.approx(0.25e6 * (SCANS - 1) / SCANS / told["us_per_scan"])
     assert told["us_per_scan"] > 0
     assert found.pose_frame == "laser"

@@ -79,6 +79,7 @@ class Slam(LogOptions):
             "slam": {
                 "keyframes": len(slammed.keyframes),
                 "loops": slammed.closures,
+                "unit_variance": slammed.unit_variance,
                 "laser_offset": self.laser_offset,  # to read the log once more at the trajectory
             },
             **at_laser,
@@ -220,6 +221,7 @@ def _summary(
         "scans": len(trajectory),
         "keyframes": len(slammed.keyframes),
         "loops": slammed.closures,
+        "unit_variance": slammed.unit_variance,
         "driven_m": float(driven),
         "lines": int(np.asarray(line_map.lines.valid).sum()),
         "circles": int(np.asarray(line_map.circles.valid).sum()),
@@ -236,6 +238,8 @@ def _in_words(summary: dict[str, Any]) -> str:
         f"{summary['loops']} loops closed\n"
         f"{summary['lines']} lines, {summary['circles']} circles; {summary['explained']:.1%} of the returns under 20 m "
         "lie within 10 cm of them\n"
+        f"variance of unit weight of the adjustment: {summary['unit_variance']:.2f}"
+        f"{', by which the covariances are widened' if summary['unit_variance'] > 1 else ''}\n"
         f"{summary['seconds_to_first_chunk']:.1f} s to compile, {then or 'too few scans to time'}\n"
         f"map:         {summary['map']}\n"
         f"picture:     {summary['picture']}\n"

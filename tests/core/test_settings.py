@@ -48,6 +48,12 @@ def test_what_does_not_exist_or_go_together_is_refused(
         call()
 
 
+def test_a_pose_without_its_covariance_is_refused(as_users_run_it: None) -> None:
+    no_pose: Any = POSE.mean
+    with pytest.raises(TypeError, match="pose must be a Pose, with mean and covariance, not an array alone"):
+        extract(SCAN, no_pose)
+
+
 def test_the_presets_are_those_of_their_names() -> None:
     assert preset("default")["thresholds"] == Thresholds()
     assert preset("paper")["thresholds"] == PAPER_THRESHOLDS
