@@ -1,5 +1,6 @@
 """`linemap simulate`, `linemap evaluate`, `linemap trials`: from a world to a log and back to a score."""
 
+import contextlib
 import dataclasses
 import json
 import re
@@ -15,7 +16,7 @@ import pytest
 import shapely
 
 from linemap_jax.cli import main, trials
-from linemap_jax.cli.options import MOST_SCANS
+from linemap_jax.cli.options import MOST_SCANS, UsageError
 from linemap_jax.cli.worlds import WorldKind, made_world
 from linemap_jax.core.mapping import empty_map
 from linemap_jax.core.settings import Capacity
@@ -355,6 +356,17 @@ def test_trials_that_were_stopped_go_on_with_the_same_result(run, tmp_path: Path
     assert [x["value"] for x in variants] == pytest.approx([9.21 * x for x in (0.25, 0.5, 0.7, 1, 1.4, 2, 4)])
     missed = [x["missed_matches"] for x in variants]
     assert missed == sorted(missed, reverse=True)
+
+
+@pytest.mark.parametrize(("asked", "hosts", "of_cpu"), [(None, 1, 2), (1, 1, 2), (8, 1, 8), (9, 2, 5), (257, 1, 2)])
+def test_a_processor_stands_for_as_many_devices_as_are_asked_for(asked, hosts, of_cpu, monkeypatch, tmp_path) -> None:
+    told: dict[str, int] = {}
+    monkeypatch.setattr(trials.os, "sched_getaffinity", lambda _: {0, 1})
+    monkeypatch.setattr(jax.config, "update", told.__setitem__)
+    monkeypatch.setattr(trials.Trials, "_connect", lambda _: None)
+    with contextlib.suppress(UsageError):  # the devices of this process are counted already
+        trials.Trials(output=tmp_path, devices=asked, hosts=hosts)._mesh()
+    assert told == {"jax_num_cpu_devices": of_cpu}
 
 
 def test_trials_that_make_no_sense_are_refused(refuse, tmp_path: Path) -> None:

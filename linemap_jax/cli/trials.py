@@ -29,6 +29,9 @@ BATCH_RUNS = 32
 CHUNK_RUNS = 256
 """Drives after which the results are written, of all devices together."""
 
+MOST_OF_CPU = 256
+"""Devices that the processors of one machine are taken for, where more are asked for than there are processors."""
+
 LONGEST_WAIT = 60.0
 """Seconds that host 0 has to appear."""
 
@@ -187,13 +190,14 @@ class Trials:
             raise UsageError("several --hosts need a --coordinator, and one host needs none")
 
     def _mesh(self) -> "Mesh":
-        """The devices in a row; of processors, as many as the machine has."""
+        """The devices in a row; of processors, as many as the machine has, or as are asked for."""
         processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         import jax
 
         # Without effect where jax has counted its devices already, or where they are accelerators.
+        asked = -(-(self.devices or 0) // self.hosts)
         with contextlib.suppress(RuntimeError):
-            jax.config.update("jax_num_cpu_devices", processors)
+            jax.config.update("jax_num_cpu_devices", asked if processors < asked <= MOST_OF_CPU else processors)
         if self.hosts > 1:
             self._connect()
         from linemap_jax.lab.batch import mesh_of_devices
