@@ -7,7 +7,7 @@ capacity runs full the chunk is done again with twice the room: no primitive is 
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
-from typing import Any
+from typing import Any, Unpack
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool
 
 from linemap_jax.core.extract import extract
 from linemap_jax.core.mapping import empty_map, update
-from linemap_jax.core.settings import SCAN_CAPACITY, Capacity
+from linemap_jax.core.settings import SCAN_CAPACITY, Capacity, ExtractOptions, UpdateOptions
 from linemap_jax.core.slots import resize
 from linemap_jax.core.state import LEFT_OUT, Extraction, LineMap, Pose, Report, Scan, Status, pad_stack
 
@@ -41,7 +41,7 @@ def build(
     map_capacity: Capacity = Capacity(),
     capacity: Capacity = SCAN_CAPACITY,
     chunk: int = CHUNK,
-    **options: Any,
+    **options: Unpack[UpdateOptions],
 ) -> tuple[LineMap, Report]:
     """Build a map from a whole log.
 
@@ -83,7 +83,7 @@ def build_chunks(
     capacity: Capacity = SCAN_CAPACITY,
     chunk: int = CHUNK,
     run: Callable[..., tuple[LineMap, Report]] | None = None,
-    **options: Any,
+    **options: Unpack[UpdateOptions],
 ) -> Iterator[tuple[LineMap, Report]]:
     """Build a map from a log that comes piece by piece: memory does not grow with its length.
 
@@ -125,7 +125,7 @@ def build_chunks(
 
 
 def extract_chunk(
-    scans: Scan, *, capacity: Capacity = SCAN_CAPACITY, chunk: int = CHUNK, **options: Any
+    scans: Scan, *, capacity: Capacity = SCAN_CAPACITY, chunk: int = CHUNK, **options: Unpack[ExtractOptions]
 ) -> tuple[Extraction, Capacity]:
     """Extract a chunk of scans, each in the frame of its sensor, with measurement noise alone.
 
@@ -149,14 +149,20 @@ def extract_chunk(
 
 
 @_jit
-def _extract(scans: Scan, **options: Any) -> Extraction:
+def _extract(scans: Scan, *, capacity: Capacity, **options: Unpack[ExtractOptions]) -> Extraction:
     dtype = scans.ranges.dtype
     here = Pose(mean=jnp.zeros(3, dtype), cov=jnp.zeros((3, 3), dtype))
-    return jax.lax.map(lambda scan: extract(scan, here, **options), scans)
+    return jax.lax.map(lambda scan: extract(scan, here, capacity=capacity, **options), scans)
 
 
 def update_chunk(
-    line_map: LineMap, scans: Scan, poses: Pose, active: Bool[Array, " T"], **options: Any
+    line_map: LineMap,
+    scans: Scan,
+    poses: Pose,
+    active: Bool[Array, " T"],
+    *,
+    capacity: Capacity = SCAN_CAPACITY,
+    **options: Unpack[UpdateOptions],
 ) -> tuple[LineMap, Report]:
     """Update a map by a chunk of scans, one after the other: what `build` runs over and over.
 
@@ -165,6 +171,7 @@ def update_chunk(
       scans: `T` scans, stacked.
       poses: `T` poses of the robot, stacked.
       active: False for scans that only fill up the chunk. Shape `[T]`.
+      capacity: slots for what one scan holds.
       **options: the remaining arguments of `update`.
 
     Returns:
@@ -173,7 +180,7 @@ def update_chunk(
 
     def step(line_map: LineMap, x: tuple[Scan, Pose, Array]) -> tuple[LineMap, Report]:
         scan, pose, is_active = x
-        look = partial(update, **options)
+        look = partial(update, capacity=capacity, **options)
         _, nothing = jax.eval_shape(look, line_map, scan, pose)
         blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), nothing)
         return jax.lax.cond(is_active, look, lambda line_map, *_: (line_map, blank), line_map, scan, pose)

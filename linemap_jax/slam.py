@@ -8,7 +8,7 @@ Scans are tracked in their own precision; the graph is float64 whatever jax is s
 import dataclasses
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Unpack
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +27,7 @@ from linemap_jax.core.estimation.surface import Surface, middle_of
 from linemap_jax.core.estimation.tracking import Track, Tracked, TrackingSettings, begin_track, track_chunk
 from linemap_jax.core.fields import documented
 from linemap_jax.core.frames_on_host import between, compose
-from linemap_jax.core.settings import SensorNoise, Thresholds
+from linemap_jax.core.settings import Method, SensorNoise, Thresholds
 from linemap_jax.core.state import LineMap, Lines, Pose, Scan, pad_stack
 
 CHUNK = 64
@@ -82,14 +82,20 @@ class Slam:
     def __init__(
         self,
         *,
-        noise: OdometryNoise = OdometryNoise(),
+        odometry_noise: OdometryNoise = OdometryNoise(),
         tracking: TrackingSettings = TrackingSettings(),
         registration: RegistrationSettings = RegistrationSettings(),
         loops: LoopSettings = LoopSettings(),
     ) -> None:
-        """An empty one; the settings are those of the functions of the same names."""
-        options = {"noise": noise, "settings": tracking, "registration": registration}
-        self._track = partial(_jit_track, **options)
+        """An empty one.
+
+        Args:
+          odometry_noise: how well the wheels count.
+          tracking: keyframes, and trust in odometry.
+          registration: of scans onto what has been seen.
+          loops: which closures are looked for and believed.
+        """
+        self._track = partial(_jit_track, noise=odometry_noise, settings=tracking, registration=registration)
         self._loops = loops
         self._close = partial(_jit_close, settings=loops, registration=registration)
         self._state: Track | None = None
@@ -234,7 +240,7 @@ class Slam:
         *,
         thresholds: Thresholds = Thresholds(),
         noise: SensorNoise = SensorNoise(),
-        **options: Any,
+        **method: Unpack[Method],
     ) -> tuple[LineMap, Float[np.ndarray, "N 3 3"]]:
         """Let poses and lines settle together; from then on the trajectory is that of the adjustment.
 
@@ -242,7 +248,7 @@ class Slam:
           line_map: made from the scans at the poses of the trajectory.
           thresholds: of extraction and matching.
           noise: of the scanner.
-          **options: the remaining ones of `extract`, as the map was made with.
+          **method: as for `extract`: how the map was made.
 
         Returns:
           The map, whose covariances now hold what the poses are uncertain by, too; and the covariances of the
@@ -256,7 +262,7 @@ class Slam:
             size = len(scans.ranges)
             poses = _uncertain(self._poses[i : i + CHUNK], SIGMA_NEXT, dtype)
             piece = pad_stack((scans, poses, jnp.asarray(numbers[i : i + CHUNK])), CHUNK)
-            seen = _jit_sightings(*piece, line_map.lines, thresholds=thresholds, noise=noise, **options)
+            seen = _jit_sightings(*piece, line_map.lines, thresholds=thresholds, noise=noise, **method)
             pieces.append(jax.tree.map(partial(_flat, size), seen))
         valid = np.concatenate([piece.valid for piece in pieces])
         seen = jax.tree.map(lambda *x: np.concatenate(x)[valid], *pieces)
@@ -349,7 +355,10 @@ def slam(
     *,
     thresholds: Thresholds = Thresholds(),
     noise: SensorNoise = SensorNoise(),
-    **settings: Any,
+    odometry_noise: OdometryNoise = OdometryNoise(),
+    tracking: TrackingSettings = TrackingSettings(),
+    registration: RegistrationSettings = RegistrationSettings(),
+    loops: LoopSettings = LoopSettings(),
 ) -> Slammed:
     """Map and trajectory of a whole log.
 
@@ -358,16 +367,19 @@ def slam(
       odometry: poses of the scanner by the robot's odometry. m, m, rad. Shape `[T, 3]`.
       thresholds: of the map.
       noise: of the scanner.
-      **settings: those of `Slam`.
+      odometry_noise: how well the wheels count.
+      tracking: keyframes, and trust in odometry.
+      registration: of scans onto what has been seen.
+      loops: which closures are looked for and believed.
 
     Returns:
       The map, the trajectory with its covariances, and the state, from which it can go on.
 
     Raises:
-      TypeError: for a setting that `Slam` does not have.
       ValueError: if there is not one pose of odometry for each scan.
     """
-    state, count, places = Slam(**settings), scans.ranges.shape[0], np.asarray(odometry)
+    state = Slam(odometry_noise=odometry_noise, tracking=tracking, registration=registration, loops=loops)
+    count, places = scans.ranges.shape[0], np.asarray(odometry)
     if places.shape != (count, 3):
         raise ValueError(f"odometry must have one pose for each scan, shape {(count, 3)}, not {places.shape}")
     for i in range(0, count, CHUNK):
@@ -412,9 +424,18 @@ _jit_middles = jax.jit(jax.vmap(middle_of))
 
 
 @partial(jax.jit, static_argnames=STATIC)
-def _jit_sightings(scans: Scan, poses: Pose, numbers: Array, lines: Lines, **options: Any) -> LineSightings:
+def _jit_sightings(
+    scans: Scan,
+    poses: Pose,
+    numbers: Array,
+    lines: Lines,
+    *,
+    thresholds: Thresholds,
+    noise: SensorNoise,
+    **method: Unpack[Method],
+) -> LineSightings:
     def of_scan(x: tuple[Scan, Pose, Array]) -> LineSightings:
-        return sightings_of_scan(*x[:2], lines, x[2], **options)
+        return sightings_of_scan(*x[:2], lines, x[2], thresholds=thresholds, noise=noise, **method)
 
     return jax.lax.map(of_scan, (scans, poses, numbers))
 

@@ -143,7 +143,7 @@ def extraction(scans: Scan, batch: int, dtype: str, choice: Preset, devices: int
     """A row of `extract`."""
     some = cast(jax.tree.map(lambda x: x[np.arange(batch) % x.shape[0]], scans), dtype)
     here = pose_at(dtype)
-    one = partial(extract, jacobians="analytic", **preset(choice))
+    one = partial(extract, **preset(choice))
 
     def several(scans: Scan) -> Any:
         return jax.lax.map(lambda scan: one(scan, here), scans, batch_size=SIDE_BY_SIDE)
@@ -206,7 +206,7 @@ def scan_to_map(log: tuple[Scan, Pose], dtype: str, choice: Preset, *, quick: bo
 
     def several(line_map: Any, scans: Scan, poses: Pose) -> Any:
         def step(line_map: Any, x: Any) -> Any:
-            after, report = update(line_map, *x, jacobians="analytic", **preset(choice))
+            after, report = update(line_map, *x, **preset(choice))
             return after, report.status
 
         return jax.lax.scan(step, line_map, (scans, poses))

@@ -101,7 +101,7 @@ def update_all(line_map: Any, scans: Any, poses: Any, name: str) -> Any:
 
 def compare_extraction(log: Any, choice: Literal["default", "paper"]) -> list[str]:
     """The cells from `scans` to `covariance`."""
-    options = preset(choice) | {"noise": SensorNoise(), "mount": Mount(), "capacity": SCAN}
+    options = {**preset(choice), "noise": SensorNoise(), "mount": Mount(), "capacity": SCAN}
     count = len(log[0].ranges)
     equal = other = unequal = undecided = 0
     estimate = covariance = 0.0
@@ -143,7 +143,7 @@ def same_beams(mine: np.ndarray, theirs: np.ndarray) -> list[tuple[int, int]]:
 
 def compare_maps(log: Any, choice: Literal["default", "paper"]) -> list[str]:
     """The cells from `map` on."""
-    options = preset(choice) | {"noise": SensorNoise(), "mount": Mount(), "scan_capacity": SCAN}
+    options = {**preset(choice), "noise": SensorNoise(), "mount": Mount(), "scan_capacity": SCAN}
     maps, reports = jax.tree.map(np.asarray, update_all(empty_map(MAP, np.float64), *log, choice))
     count = len(log[0].ranges)
     theirs, one_by_one = oracle.empty_map(MAP), oracle.empty_map(MAP)

@@ -153,7 +153,7 @@ def one_scan(key: jax.Array, cell: Cell) -> dict[str, Sample]:
     samples = consistency.known_points(key, *where)
     choices: tuple[tuple[str, Literal["default", "paper"]], ...] = (("", "default"), ("paper ", "paper"))
     for name, choice in choices:
-        longest, every = consistency.pipeline(key, *where, jacobians="analytic", **preset(choice))
+        longest, every = consistency.pipeline(key, *where, **preset(choice))
         samples |= {f"{name}longest": longest, f"{name}all": every}
     return samples
 
@@ -161,14 +161,14 @@ def one_scan(key: jax.Array, cell: Cell) -> dict[str, Sample]:
 def one_optimal_scan(key: jax.Array, cell: Cell) -> dict[str, Sample]:
     """What the optimal segmentation finds in one scan."""
     where = (cell.world, cell.path[0], cell.scanner, cell.cov_pose)
-    longest, every = consistency.pipeline(key, *where, jacobians="analytic", segmentation="optimal")
+    longest, every = consistency.pipeline(key, *where, segmentation="optimal")
     return {"longest": longest, "all": every}
 
 
 def errors_of_fits(key: jax.Array, cell: Cell) -> Any:
     """How far lines of the optimal segmentation are off, and other fits."""
     where = (cell.world, cell.path[0], cell.scanner)
-    return consistency.rho_errors(key, *where, jacobians="analytic", segmentation="optimal")
+    return consistency.rho_errors(key, *where, segmentation="optimal")
 
 
 def fused_scans(runs: int) -> str:
@@ -220,7 +220,7 @@ def many_scans(key: jax.Array, cell: Cell, *, correlation: float, models: tuple[
 def poles(runs: int) -> str:
     """Circles: known returns, what the pipeline finds, and twenty scans."""
     cells = poles_of_table()
-    pipeline = partial(consistency_of_circles.pipeline, jacobians="analytic", **preset("default"))
+    pipeline = partial(consistency_of_circles.pipeline, **preset("default"))
     experiments = {
         name: partial(on_pole, experiment=experiment)
         for name, experiment in (("known", consistency_of_circles.known_points), ("pipeline", pipeline))

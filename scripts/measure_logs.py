@@ -9,6 +9,7 @@ the table goes into README, between its markers.
 import os
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ import numpy as np
 from readme import write_part
 
 from linemap_jax import Capacity, build, preset
+from linemap_jax.core.settings import UpdateOptions
 from linemap_jax.io.log import open_log
 from linemap_jax.io.scans import chunks_of_readings
 from linemap_jax.lab.evaluation import duplicates, explained_share
@@ -26,10 +28,10 @@ DATA = Path(os.environ.get("LINEMAP_DATA", ROOT / "../shared/data"))
 LOGS = {"intel": "Intel", "aces": "ACES", "fhw": "FHW", "freiburg-079": "FR079"}
 COV_POSE = np.diag([0.05, 0.05, 0.01]) ** 2
 CHUNK = 64
-WAYS: dict[str, dict[str, Any]] = {
-    "default": preset("default"),
-    "default, `optimal`": preset("default") | {"segmentation": "optimal"},
-    "paper": preset("paper"),
+WAYS: dict[str, UpdateOptions] = {
+    "default": {**preset("default")},
+    "default, `optimal`": {**preset("default"), "segmentation": "optimal"},
+    "paper": {**preset("paper")},
 }
 """Presets, and one with the other segmentation."""
 
@@ -54,16 +56,16 @@ def main() -> int:
     return 0
 
 
-def measure(log: tuple[Any, Any], way: dict[str, Any]) -> list[str]:
+def measure(log: tuple[Any, Any], way: UpdateOptions) -> list[str]:
     """The figures of one log, mapped in some way, from the third column on."""
-    options = way | {"jacobians": "analytic", "map_capacity": Capacity(512, 256), "chunk": CHUNK}
-    build(*log, **options)  # compiles, at each size that the map grows to
+    run = partial(build, map_capacity=Capacity(512, 256), chunk=CHUNK, **way)
+    run(*log)  # compiles, at each size that the map grows to
     started = time.perf_counter()
-    line_map, _ = build(*log, **options)
+    line_map, _ = run(*log)
     jax.block_until_ready(line_map)
     seconds = time.perf_counter() - started
     count = log[0].ranges.shape[0]
-    even, _ = build(*every(log, slice(0, None, 2)), **options)
+    even, _ = run(*every(log, slice(0, None, 2)))
 
     lines = line_map.lines
     length = np.asarray(lines.length)

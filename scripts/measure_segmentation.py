@@ -89,7 +89,7 @@ def measure(scores: Any, data: Any, kind: str, budget: int, every: int) -> dict[
     @jax.jit
     def run(scans: Scan) -> Any:
         def lines_of(scan: Scan) -> Any:
-            found = extract(scan, here, segmentation="optimal", max_vertices=budget, jacobians="analytic")
+            found = extract(scan, here, segmentation="optimal", max_vertices=budget)
             return found.lines.begin, found.lines.end, found.lines.valid, *costs_of(scan, found)
 
         return jax.lax.map(lines_of, scans)
@@ -219,7 +219,7 @@ def seconds(data: Any, kind: str, budget: int | None, side_by_side: int | None) 
     scans = jax.tree.map(lambda x: x[wide], stacked_scans(data, kind))
     scans = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32 if x.dtype == np.float64 else x.dtype), scans)
     here = Pose(mean=jnp.zeros(3, jnp.float32), cov=jnp.zeros((3, 3), jnp.float32))
-    one = partial(extract, segmentation="optimal", max_vertices=budget, jacobians="analytic")
+    one = partial(extract, segmentation="optimal", max_vertices=budget)
     if side_by_side is None:
         run, given = (
             jax.jit(lambda scan: one(scan, here)),

@@ -111,7 +111,7 @@ def test_a_turn_of_the_world_does_no_more_than_in_the_oracle(log: str, name: Lit
     """Regression of y on x depends on the axes: some runs end elsewhere, and lines move a little."""
     scans, poses = stacked(log)
     both = [in_numpy(extract_all(scans, p, name=name)) for p in (poses, turned(poses))]
-    options = preset(name) | {"noise": SensorNoise(), "mount": Mount(), "capacity": SCAN}
+    options = {**preset(name), "noise": SensorNoise(), "mount": Mount(), "capacity": SCAN}
     lost = {"mine": 0, "theirs": 0}
     back = np.array([[np.cos(TURN), np.sin(TURN)], [-np.sin(TURN), np.cos(TURN)]])
     moved = []

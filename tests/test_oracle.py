@@ -125,7 +125,7 @@ def test_a_log_is_mapped_alike_by_either_derivatives(name: Any) -> None:
 
 @partial(as_built, static_argnames=("name", "pose_error"))
 def update_one(line_map: Any, scan: Any, pose: Any, name: Any, pose_error: Any) -> Any:
-    options = preset(name) | {"pose_error": pose_error, "persistence": PERSISTENCE}
+    options = {**preset(name), "pose_error": pose_error, "persistence": PERSISTENCE}
     return update(line_map, scan, pose, capacity=SCAN, **options)
 
 

@@ -117,7 +117,7 @@ def options_of_method(
     from linemap_jax.core.settings import Persistence, SensorNoise, preset
     from linemap_jax.io.config import read_config
 
-    options = preset(name) | {"noise": noise, "persistence": Persistence()}
+    options: dict[str, Any] = {**preset(name), "noise": noise, "persistence": Persistence()}
     for section, fields in (read_config(config) if config else {}).items():
         options[section] = dataclasses.replace(options[section] or SensorNoise(), **fields)
     return options

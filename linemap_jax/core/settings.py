@@ -6,7 +6,7 @@ of its thresholds (30 cm, and 5 in Eq. (22)); the other values of `paper` are ou
 """
 
 import dataclasses
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple, TypedDict
 
 from jaxtyping import Array, Float
 
@@ -205,7 +205,40 @@ PAPER_THRESHOLDS = Thresholds(
 PAPER_RULES = Rules(**{field.name: False for field in dataclasses.fields(Rules)})
 
 
-def preset(name: Literal["default", "paper"]) -> dict[str, Any]:
+class Method(TypedDict, total=False):
+    """The keyword arguments of `extract` that say how it reads a scan. Static: each decides which program it is."""
+
+    rules: Rules
+    segmentation: Segmentation
+    max_vertices: int | None
+    covariance: Covariance
+    jacobians: Jacobians
+
+
+class ExtractOptions(Method, total=False):
+    """The keyword arguments of `extract`, but for the capacity."""
+
+    thresholds: Thresholds | None
+    noise: SensorNoise | None
+    mount: Mount | None
+
+
+class UpdateOptions(ExtractOptions, total=False):
+    """The keyword arguments of `update`, but for the capacity."""
+
+    pose_error: PoseError
+    persistence: Persistence | None
+
+
+class Preset(TypedDict):
+    """The keyword arguments of `extract` and `update` that make up a preset."""
+
+    thresholds: Thresholds
+    rules: Rules
+    covariance: Covariance
+
+
+def preset(name: Literal["default", "paper"]) -> Preset:
     """The keyword arguments of `extract`, `update` and `build` that make up a preset.
 
     Args:

@@ -18,7 +18,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from statistics import NormalDist
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Unpack
 
 import jax
 import jax.numpy as jnp
@@ -35,6 +35,7 @@ from linemap_jax.core.propagation import inverse, quadratic
 from linemap_jax.core.runs import Runs
 from linemap_jax.core.sensor import points_from_scan
 from linemap_jax.core.settings import (
+    Method,
     Mount,
     Number,
     Persistence,
@@ -150,7 +151,9 @@ def pipeline(
     pose: Float[Array, "3"],
     scanner: Scanner,
     cov_pose: Float[Array, "3 3"],
-    **options: Any,
+    *,
+    thresholds: Thresholds = Thresholds(),
+    **method: Unpack[Method],
 ) -> tuple[Sample, Sample]:
     """The NEES of what `extract` finds: of the longest line of one wall, and of all lines.
 
@@ -162,7 +165,8 @@ def pipeline(
       pose: the true one.
       scanner: its noise is what the extraction believes.
       cov_pose: of the pose's error.
-      **options: of `extract`.
+      thresholds: of `extract`.
+      **method: of `extract`.
 
     Returns:
       The sample of the longest line, and those of all lines, `[K]`.
@@ -170,7 +174,9 @@ def pipeline(
     of_wall, of_scan, of_pose = jax.random.split(key, 3)
     which, seen = _visible_wall(of_wall, world, pose, scanner)
     scan, truth = simulate_scan(of_scan, world, pose, scanner)
-    found = extract(scan, estimate_pose(of_pose, pose, cov_pose), noise=noise_of(scanner), **options)
+    found = extract(
+        scan, estimate_pose(of_pose, pose, cov_pose), thresholds=thresholds, noise=noise_of(scanner), **method
+    )
     lines, count = found.lines, seen.shape[0]
     beams = (found.line_of_beam[:, None] == jnp.arange(lines.valid.shape[0])[None]).astype(jnp.float32)
     met = (truth.thing[:, None] == jnp.arange(count)[None]).astype(jnp.float32)
@@ -183,7 +189,7 @@ def pipeline(
 
 
 def rho_errors(
-    key: Array, world: World, pose: Float[Array, "3"], scanner: Scanner, **options: Any
+    key: Array, world: World, pose: Float[Array, "3"], scanner: Scanner, **method: Unpack[Method]
 ) -> tuple[Float[Array, "3"], Bool[Array, ""]]:
     """Errors of the distance to a wall, by the longest line that `extract` finds of it and by other fits of its points.
 
@@ -192,7 +198,7 @@ def rho_errors(
       world: walls.
       pose: of the robot, known.
       scanner: its noise is what the fits believe.
-      **options: of `extract`.
+      **method: of `extract`.
 
     Returns:
       Errors of rho, m: of the line; of orthogonal regression; and of orthogonal regression with each point weighted by
@@ -203,7 +209,7 @@ def rho_errors(
     which, _ = _visible_wall(of_wall, world, pose, scanner)
     scan, truth = simulate_scan(of_scan, world, pose, scanner)
     here = Pose(mean=jnp.zeros(3, pose.dtype), cov=jnp.zeros((3, 3), pose.dtype))
-    found = extract(scan, here, noise=noise_of(scanner), **options)
+    found = extract(scan, here, noise=noise_of(scanner), **method)
     lines = found.lines
     on_wall = jnp.zeros(lines.valid.shape[0] + 1).at[found.line_of_beam].add(truth.thing == which)[:-1]
     line = jnp.argmax(jnp.where(lines.valid, on_wall, -1))

@@ -11,7 +11,7 @@ experiment is a function of a key that makes one run; map it over keys:
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Unpack
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,7 @@ from linemap_jax.core.fusion import forget, fuse_circles
 from linemap_jax.core.matching import match_circles
 from linemap_jax.core.runs import Runs
 from linemap_jax.core.sensor import points_from_scan
-from linemap_jax.core.settings import Mount, Number, Rules, Thresholds, persistence_of
+from linemap_jax.core.settings import Method, Mount, Number, Rules, Thresholds, persistence_of
 from linemap_jax.core.slots import choose
 from linemap_jax.core.state import Circles, Pose, Scan, empty_circles
 from linemap_jax.lab.consistency import Model, Sample, nees
@@ -80,7 +80,9 @@ def pipeline(
     pose: Float[Array, "3"],
     scanner: Scanner,
     cov_pose: Float[Array, "3 3"],
-    **options: Any,
+    *,
+    thresholds: Thresholds = Thresholds(),
+    **method: Unpack[Method],
 ) -> Sample:
     """The fitted circle that `extract` finds, the nearest to the pole; arguments as of `known_points`.
 
@@ -91,13 +93,14 @@ def pipeline(
       pose: as above.
       scanner: as above.
       cov_pose: as above.
-      **options: of `extract`.
+      thresholds: of `extract`.
+      **method: of `extract`.
 
     Returns:
       The sample; it does not count where there is no fitted circle.
     """
     scan, _, pose, estimate = _look(key, center, radius, pose, scanner, cov_pose)
-    circles = extract(scan, estimate, noise=noise_of(scanner), **options).circles
+    circles = extract(scan, estimate, thresholds=thresholds, noise=noise_of(scanner), **method).circles
     step = circles.center - center[None]
     distance = jnp.where(circles.valid & circles.fitted, dot(step, step), jnp.inf)
     circle = jax.tree.map(lambda x: x[jnp.argmin(distance)], circles)

@@ -64,7 +64,7 @@ def inputs(ranges: np.ndarray, cov: np.ndarray) -> tuple[Any, ...]:
 def of_extraction(
     ranges: jax.Array, pose: Pose, noise: Any, mount: Any, thresholds: Any, scan: Scan, name: str, jacobians: str
 ) -> jax.Array:
-    options = preset(name) | {"thresholds": thresholds, "noise": noise, "mount": mount, "capacity": SCAN}
+    options = {**preset(name), "thresholds": thresholds, "noise": noise, "mount": mount, "capacity": SCAN}
     found = extract(dataclasses.replace(scan, ranges=ranges), pose, jacobians=jacobians, **options)
     return moments(found)
 
@@ -75,7 +75,7 @@ def of_map(
     """After a step of each input, all of its numbers alike; and the map itself."""
     given = [jax.tree.map(lambda x, step=step: x + step, x) for x, step in zip(given, steps, strict=True)]
     ranges, pose, noise, mount, thresholds = given
-    options = preset(name) | {"thresholds": thresholds, "noise": noise, "mount": mount, "capacity": SCAN}
+    options = {**preset(name), "thresholds": thresholds, "noise": noise, "mount": mount, "capacity": SCAN}
     scan = dataclasses.replace(scan, ranges=ranges)
     line_map, _ = update(line_map, scan, pose, jacobians="analytic", **options)
     return moments(line_map), line_map

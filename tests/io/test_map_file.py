@@ -192,7 +192,7 @@ def test_free_slots_are_those_of_an_empty_map(tmp_path: Path) -> None:
 
 
 def test_settings_may_be_the_presets_themselves(tmp_path: Path) -> None:
-    settings = preset("default") | {"capacity": Capacity(8, 4), "range_sigma": jnp.float32(0.1), "mount": np.zeros(3)}
+    settings = {**preset("default"), "capacity": Capacity(8, 4), "range_sigma": jnp.float32(0.1), "mount": np.zeros(3)}
     write_map(tmp_path / "map.json", random_map("float32"), settings)
     _, found = read_map(tmp_path / "map.json")
     assert found["thresholds"]["match_nis"] == 9.21

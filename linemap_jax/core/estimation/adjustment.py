@@ -7,7 +7,7 @@ lines, with what correlates them.
 """
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Unpack
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ from linemap_jax.core.fields import documented
 from linemap_jax.core.frames import between, dot, perp, rotate, unit, wrap_angle
 from linemap_jax.core.matching import best_line, with_sign
 from linemap_jax.core.propagation import apply, inverse, propagate, square_root, symmetric
-from linemap_jax.core.settings import Number, SensorNoise, Thresholds
+from linemap_jax.core.settings import SCAN_CAPACITY, Capacity, Method, Number, SensorNoise, Thresholds
 from linemap_jax.core.state import LineMap, Lines, Pose, Scan, pytree
 
 WIDENING = (100.0, 10.0, 1.0, 1.0, 1.0)
@@ -74,9 +74,10 @@ def sightings_of_scan(
     *,
     thresholds: Thresholds,
     noise: SensorNoise,
-    **options: Any,
+    capacity: Capacity = SCAN_CAPACITY,
+    **method: Unpack[Method],
 ) -> LineSightings:
-    """The lines of the map that a keyframe has seen, as many as the capacity of a scan, padded.
+    """The lines of the map that a keyframe has seen, padded to the capacity of a scan.
 
     Args:
       scan: of the keyframe.
@@ -85,12 +86,13 @@ def sightings_of_scan(
       keyframe: its number.
       thresholds: of extraction and matching.
       noise: of the scanner.
-      **options: the remaining ones of `extract`.
+      capacity: slots for what one scan holds.
+      **method: as for `extract`.
 
     Returns:
       The sightings; those of lines that match no line of the map are not valid.
     """
-    found = extract(scan, pose, thresholds=thresholds, noise=noise, **options)
+    found = extract(scan, pose, thresholds=thresholds, noise=noise, capacity=capacity, **method)
     slot, nis = best_line(found.lines, lines, thresholds, "independent")
     reverse = jnp.abs(wrap_angle(found.lines.angle - lines.angle[slot])) > jnp.pi / 2
     foot = found.lines.anchor + found.lines.offset[:, None] * found.lines.normal - pose.mean[None, :2]

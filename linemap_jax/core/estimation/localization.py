@@ -25,7 +25,7 @@ A scan that the map does not explain is not used; several of them, and the filte
 """
 
 import dataclasses
-from typing import Any
+from typing import Any, Unpack
 
 import jax
 import jax.numpy as jnp
@@ -49,7 +49,7 @@ from linemap_jax.core.frames import (
 from linemap_jax.core.matching import compare_lines, compare_pieces, match_lines
 from linemap_jax.core.propagation import inverse, product, propagate, quadratic, square_root, symmetric
 from linemap_jax.core.sensor import point_from_measurement
-from linemap_jax.core.settings import SCAN_CAPACITY, Capacity, Jacobians, Mount, Number, Rules, SensorNoise, Thresholds
+from linemap_jax.core.settings import SCAN_CAPACITY, Capacity, Method, Mount, Number, Rules, SensorNoise, Thresholds
 from linemap_jax.core.slots import all_true, choose, directed, least, take
 from linemap_jax.core.state import Circles, LineMap, Lines, Pose, Scan, Status, pytree, squared
 
@@ -249,7 +249,8 @@ def localize(
     noise: SensorNoise | None = None,
     mount: Mount | None = None,
     settings: LocalizationSettings | None = None,
-    **options: Any,
+    capacity: Capacity = SCAN_CAPACITY,
+    **method: Unpack[Method],
 ) -> tuple[Belief, Located]:
     """The poses of a stack of scans, one after the other.
 
@@ -267,21 +268,22 @@ def localize(
       noise: of the sensor.
       mount: of the scanner on the robot.
       settings: thresholds of the filter.
-      **options: `capacity`, `rules`, `segmentation`, `max_vertices`, `jacobians`, `covariance`, of `extract`.
+      capacity: slots for what one scan holds.
+      **method: as for `extract`.
 
     Returns:
       The belief after the last scan, and what the filter says after each, stacked `[T]`.
     """
     odometry, thresholds, noise = odometry or OdometryNoise(), thresholds or Thresholds(), noise or SensorNoise()
     mount, settings = mount or Mount(), settings or LocalizationSettings()
-    rules = options.get("rules", Rules())
+    rules = method.get("rules", Rules())
     lines = directed(line_map.lines)
 
     def step(belief: Belief, x: tuple[Scan, Array, Array, Array]) -> tuple[Belief, Located]:
         scan, move, more, is_active = x
         finite = jnp.all(jnp.isfinite(move))
         expected = predict(belief, jnp.where(finite, move, 0), more, odometry)
-        seen = observe(scan, mount, thresholds=thresholds, noise=noise, **options)
+        seen = observe(scan, mount, thresholds=thresholds, noise=noise, capacity=capacity, **method)
         moved = jnp.where(finite, jnp.sqrt(dot(move[:2], move[:2])), 0)
         after, located = locate(expected, seen, moved, line_map, lines, field, thresholds, rules, noise, settings)
         status = located.status | jnp.where(finite, 0, int(Status.POSE_NOT_FINITE))
@@ -319,9 +321,7 @@ def observe(
     thresholds: Thresholds,
     noise: SensorNoise,
     capacity: Capacity = SCAN_CAPACITY,
-    rules: Rules = Rules(),
-    jacobians: Jacobians = "analytic",
-    **options: Any,
+    **method: Unpack[Method],
 ) -> Seen:
     """Lines, circles and points of a scan in the frame of the robot, whatever its pose.
 
@@ -331,26 +331,14 @@ def observe(
       thresholds: criteria of the extraction.
       noise: of the sensor.
       capacity: slots for lines and circles.
-      rules: which reading of the method.
-      jacobians: "autodiff" or "analytic".
-      **options: the remaining ones of `extract`.
+      **method: as for `extract`.
 
     Returns:
       What the scan holds; covariances are those of the measurement alone.
     """
     dtype = scan.ranges.dtype
     scan, here, _ = usable(scan, Pose(mean=jnp.zeros(3, dtype), cov=jnp.zeros((3, 3), dtype)))
-    found = extract(
-        scan,
-        here,
-        thresholds=thresholds,
-        noise=noise,
-        mount=mount,
-        capacity=capacity,
-        rules=rules,
-        jacobians=jacobians,
-        **options,
-    )
+    found = extract(scan, here, thresholds=thresholds, noise=noise, mount=mount, capacity=capacity, **method)
     at = jnp.stack([jnp.asarray(mount.x), jnp.asarray(mount.y), jnp.asarray(mount.theta)]).astype(dtype)
     measured = jnp.stack([scan.ranges, scan.bearings], -1)
     in_circle = (found.circle_of_beam >= 0) & found.circles.fitted[jnp.maximum(found.circle_of_beam, 0)]

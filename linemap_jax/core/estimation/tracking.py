@@ -202,7 +202,14 @@ def _with_keyframe(state: Track, surface: Surface, here: Float[Array, "3"], is_k
 
 
 def track_chunk(
-    state: Track, scans: Scan, odometry: Float[Array, "T 3"], active: Bool[Array, " T"], **options: object
+    state: Track,
+    scans: Scan,
+    odometry: Float[Array, "T 3"],
+    active: Bool[Array, " T"],
+    *,
+    noise: OdometryNoise = OdometryNoise(),
+    settings: TrackingSettings = TrackingSettings(),
+    registration: RegistrationSettings = RegistrationSettings(),
 ) -> tuple[Track, Tracked]:
     """Scans one after the other; where `active` is False a scan only fills up the chunk, and changes nothing.
 
@@ -211,7 +218,9 @@ def track_chunk(
       scans: `T` scans, stacked.
       odometry: poses of the scanner by odometry.
       active: which of them count.
-      **options: the remaining arguments of `track`.
+      noise: of the odometry.
+      settings: keyframes, and trust in odometry.
+      registration: of a scan.
 
     Returns:
       The state after them, and what is said of each, stacked `[T]`.
@@ -219,7 +228,7 @@ def track_chunk(
 
     def step(state: Track, x: tuple[Scan, Array, Array]) -> tuple[Track, Tracked]:
         scan, pose, is_active = x
-        after, said = track(state, scan, pose, **options)  # pyright: ignore[reportArgumentType]
+        after, said = track(state, scan, pose, noise=noise, settings=settings, registration=registration)
         return jax.tree.map(lambda new, old: jnp.where(is_active, new, old), after, state), said
 
     return jax.lax.scan(step, state, (scans, odometry, active))
