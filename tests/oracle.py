@@ -548,7 +548,7 @@ def without_corners(sweep: Sweep, runs: list[list[int]], margin: Margin) -> list
     """The points of each run that no line beside it can claim.
 
     At an end of a run, points may be the next line's that still passed criterion 2. They are left out up to the first
-    one that is surely none, unless they are more than a third, or both ends together might leave fewer than three.
+    one that is surely none, unless that leaves less than a third of the run, or fewer than three.
 
     Args:
       sweep: the valid beams.
@@ -569,7 +569,7 @@ def without_corners(sweep: Sweep, runs: list[list[int]], margin: Margin) -> list
             across = np.abs((sweep.o[run] - beside.centroid) @ normal)
             own = [i for i in range(len(run)) if margin.below(UNSURE_SIGMAS * float(sigma[i]), float(across[i]))]
             beyond = (own[0] if side < 0 else len(run) - 1 - own[-1]) if own else len(run)
-            if 3 * beyond <= len(run) and 2 * beyond <= len(run) - 3:
+            if _are_enough(len(run) - beyond, run):
                 begin, end = (beyond, end) if side < 0 else (begin, len(run) - beyond)
         result.append(run[begin:end])
     return result
@@ -578,7 +578,7 @@ def without_corners(sweep: Sweep, runs: list[list[int]], margin: Margin) -> list
 def without_sparse(
     sweep: Sweep, runs: list[list[int]], kept: list[list[int]], thresholds: Any, margin: Margin
 ) -> list[list[int]]:
-    """The points of each run that are surely near enough to their neighbours for criterion 1; none if hardly any is.
+    """The points of each run that are surely near enough to their neighbours for criterion 1.
 
     Args:
       sweep: the valid beams.
@@ -599,8 +599,13 @@ def without_sparse(
             farthest = arc / math.cos(incidence) + UNSURE_SIGMAS * math.sqrt(2) * noise
             if margin.below(farthest, _gap_gate(arc, thresholds, sweep.sr)):
                 dense.append(i)
-        result.append(dense if len(dense) >= 3 and 3 * len(dense) >= len(run) else [])
+        result.append(dense)
     return result
+
+
+def _are_enough(count: int, run: list[int]) -> bool:
+    """Whether so many of the points of a run make a line."""
+    return count >= 3 and 3 * count >= len(run)
 
 
 def likeliest_line(
@@ -946,7 +951,7 @@ def extract(
         kept_points = without_sparse(sweep, of_lines, kept_points, thresholds, margin)
     found = []
     for run, points in zip(of_lines, kept_points, strict=True):
-        if points:
+        if _are_enough(len(points), run):
             line_of_beam[sweep.beam[run]] = len(found)
             found.append(_line_of_run(sweep, run, points, covariance=covariance, rules=rules))
         else:

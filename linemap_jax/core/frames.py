@@ -23,9 +23,10 @@ def perp(vector: Float[Array, "*s 2"]) -> Float[Array, "*s 2"]:
     return jnp.stack([-vector[..., 1], vector[..., 0]], -1)
 
 
-def rotate(angle: Float[Array, ""], vector: Float[Array, "2"]) -> Float[Array, "2"]:
-    """The `vector` turned by `angle`, in radians."""
-    return vector[0] * unit(angle) + vector[1] * perp(unit(angle))
+def rotate(angle: Float[Array, ""], vector: Float[Array, "*s 2"]) -> Float[Array, "*s 2"]:
+    """The `vector`, or each of many, turned by `angle`, in radians."""
+    ahead = jnp.expand_dims(unit(angle), tuple(range(vector.ndim - 1)))
+    return vector[..., :1] * ahead + vector[..., 1:] * perp(ahead)
 
 
 def compose(pose: Float[Array, "3"], step: Float[Array, "3"]) -> Float[Array, "3"]:

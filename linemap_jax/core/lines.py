@@ -352,12 +352,13 @@ def _at_corners(
     """The points at the ends of the runs that may belong to the line beside them.
 
     Just past a corner, points of the next wall still pass criterion 2. At an end of a run, a point that lies within
-    `UNSURE_SIGMAS` of the line next to it in the sweep is left out of the fit, with all points beyond it; unless these
-    are more than a third, as where two pieces of one wall follow each other, or too few would be left.
+    `UNSURE_SIGMAS` of the line next to it in the sweep is left out of the fit, with all points beyond it; unless less
+    than a third would be left, as where two pieces of one wall follow each other, or fewer than three. A run that began
+    before a corner may hold many points of the wall that ended there: on a short wall they are half of it.
     """
     index = jnp.arange(runs.of_point.shape[0], dtype=jnp.int32)
     count = runs.valid.shape[0]
-    most = jnp.minimum(size / 3, (size - MIN_POINTS) / 2)
+    most = size - jnp.maximum(size / 3, MIN_POINTS)
     left_out = jnp.zeros(index.shape, bool)
     for side in (-1, 1):
         # The line beside each run, in front of its first point or behind its last one

@@ -174,12 +174,11 @@ def measured() -> dict[str, Any]:
     scan = Scan.from_ranges(ranges, bearings)
     points = points_from_scan(scan, POSE, Mount(x=0.2, y=-0.1, theta=0.3), jacobians="analytic")
     runs = runs_at(40, *SPANS)
+    measure = jax.jit(measure_lines, static_argnames=("maximum_likelihood", "covariance", "jacobians"))
     results = {
         (covariance, jacobians): jax.tree.map(
             np.asarray,
-            measure_lines(
-                points, POSE, runs, NOISE, maximum_likelihood=False, covariance=covariance, jacobians=jacobians
-            ),
+            measure(points, POSE, runs, NOISE, maximum_likelihood=False, covariance=covariance, jacobians=jacobians),
         )
         for covariance in ("exact", "printed")
         for jacobians in ("autodiff", "analytic")
@@ -189,7 +188,7 @@ def measured() -> dict[str, Any]:
 
 def brute_jacobian(points: Any, runs: Runs, anchor: np.ndarray) -> np.ndarray:
     """d(offset, angle) of each line by all coordinates of all points, shape [K, 2, 2 N]."""
-    jac = jax.jacfwd(estimate)(jnp.asarray(points.position), runs, jnp.asarray(anchor))
+    jac = jax.jit(jax.jacfwd(estimate))(jnp.asarray(points.position), runs, jnp.asarray(anchor))
     return np.asarray(jac).transpose(1, 0, 2, 3).reshape(anchor.shape[0], 2, -1)
 
 
@@ -318,7 +317,8 @@ def test_points_that_noise_may_have_brought_from_the_wall_beside_are_left_out() 
     here = Pose(mean=jnp.zeros(3), cov=jnp.zeros((3, 3)))
     points = points_from_scan(scan, here, Mount(), jacobians="analytic")
     noise, rules = SensorNoise(range_sigma=0.05, bearing_sigma=0.0), Rules(leave_out_sparse=False)
-    kept = choose_points(points, runs_at(41, (0, 20), (21, 40)), Thresholds(), noise, rules)
+    choose = jax.jit(choose_points, static_argnames="rules")
+    kept = choose(points, runs_at(41, (0, 20), (21, 40)), Thresholds(), noise, rules=rules)
     x, y = np.asarray(points.position).T
     beside = np.abs(3 - x + np.where(np.arange(41) <= 20, -y, y)) / np.sqrt(2)
     unsure = beside < 3 * 0.05 * np.cos(np.pi / 4 + np.abs(bearings))

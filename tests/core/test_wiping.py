@@ -31,6 +31,8 @@ from linemap_jax.core.wiping import (
 )
 
 remaining_jit = jax.jit(remaining)
+swath_jit = jax.jit(swath_of_scan)
+passed_jit = jax.jit(passed_through)
 NUMBER = st.integers(-40, 40).map(lambda i: i / 8)
 
 
@@ -255,13 +257,16 @@ def test_a_door_that_opens_and_closes_does_not_make_its_wall_better_known(pose_e
     def door(line: Lines, slot: jax.Array) -> Any:
         return jnp.array([-0.5]), jnp.array([1.5]), jnp.array([True])
 
-    pieces, _ = wipe_lines(before, before.valid, door, one_centimetre, Thresholds(), share_information=True)
+    wipe = jax.jit(lambda x: wipe_lines(x, x.valid, door, one_centimetre, Thresholds(), share_information=True))
+    pieces, _ = wipe(before)
     assert pieces.valid.sum() == 2
     np.testing.assert_allclose(1 / pieces.cov_independent[:2, 1, 1], 1e5 * np.array([2.5, 1.5]) / 4, rtol=1e-6)
     # One of them grows over the other, and they are one again.
     grown = dataclasses.replace(pieces, extent=pieces.extent.at[0, 1].add(4.0))
     touched, alone = jax.tree.map(lambda x: x[:1], grown), jnp.zeros((1, 6), bool)
-    after, _, merged = merge_lines(grown, touched, jnp.zeros(1, jnp.int32), alone, Thresholds(), Rules(), pose_error)
+    merge = jax.jit(merge_lines, static_argnames=("rules", "pose_error"))
+    slot = jnp.zeros(1, jnp.int32)
+    after, _, merged = merge(grown, touched, slot, alone, Thresholds(), rules=Rules(), pose_error=pose_error)
     assert merged == 1
     again = jax.tree.map(lambda x: x[0], after)
     np.testing.assert_allclose(
@@ -308,9 +313,9 @@ def test_a_thing_that_was_seen_anew_is_not_gone_though_beams_passed_where_it_was
 def test_beams_never_wipe_the_line_that_they_measure(own: int, gone: bool) -> None:
     found = lines_of(([3.0, -3.0], [3.0, 3.0]), capacity=1)
     points = points_from_scan(Scan.from_ranges(WALL, BEARINGS), HERE, Mount(), jacobians="analytic")
-    swath = swath_of_scan(points, HERE, jnp.zeros(91, jnp.int32), found, jnp.array([own]), jnp.array([1]), Thresholds())
+    swath = swath_jit(points, HERE, jnp.zeros(91, jnp.int32), found, jnp.array([own]), jnp.array([1]), Thresholds())
     line = jax.tree.map(lambda x: x[0], lines_of(([2.8, -1.0], [2.8, 1.0])))
-    _, _, which = passed_through(line, jnp.array(0), swath, HERE.cov, Thresholds(), SensorNoise())
+    _, _, which = passed_jit(line, jnp.array(0), swath, HERE.cov, Thresholds(), SensorNoise())
     assert bool(which.any()) == gone
 
 
@@ -322,7 +327,7 @@ def test_beams_never_wipe_the_line_that_they_measure(own: int, gone: bool) -> No
 def test_circles_that_beams_passed(x: float, radius: float, gone: bool) -> None:
     found = lines_of(([3.0, -3.0], [3.0, 3.0]), capacity=1)
     points = points_from_scan(Scan.from_ranges(WALL, BEARINGS), HERE, Mount(), jacobians="analytic")
-    swath = swath_of_scan(points, HERE, jnp.zeros(91, jnp.int32), found, jnp.array([0]), jnp.array([1]), Thresholds())
+    swath = swath_jit(points, HERE, jnp.zeros(91, jnp.int32), found, jnp.array([0]), jnp.array([1]), Thresholds())
     circles = circle_at(x, 0.2, radius)
     assert bool(passed_circles(circles, swath, HERE.cov, Thresholds(), SensorNoise())[0]) == gone
 
@@ -365,20 +370,20 @@ def test_a_beam_passed_if_it_ended_beyond_the_line_by_the_spread_of_that() -> No
     where = Pose(mean=jnp.asarray(pose), cov=jnp.asarray(cov_pose))
     points = points_from_scan(scan, where, Mount(*mount), jacobians="analytic")
     none = jnp.array([-1])
-    swath = swath_of_scan(points, where, jnp.full(2, -1), lines_of(capacity=1), none, none, Thresholds())
+    swath = swath_jit(points, where, jnp.full(2, -1), lines_of(capacity=1), none, none, Thresholds())
     for sigmas, gone in ((0.999, True), (1.001, False)):
         # Of the two beams the one with the larger spread decides.
         gates = Thresholds(wipe_sigmas=sigmas * beyond / spread.max(), match_distance=0.0)
-        assert bool(passed_through(line, jnp.array(0), swath, where.cov, gates, noise)[2][0]) == gone
+        assert bool(passed_jit(line, jnp.array(0), swath, where.cov, gates, noise)[2][0]) == gone
 
 
 def test_a_line_that_two_beams_passed_is_looked_at() -> None:
     """What is cheap to tell may not say no where something is gone: two beams are enough, one is not."""
     points = points_from_scan(Scan.from_ranges(WALL, BEARINGS), HERE, Mount(), jacobians="analytic")
     none = jnp.array([-1])
-    swath = swath_of_scan(points, HERE, jnp.full(91, -1), lines_of(capacity=1), none, none, Thresholds())
+    swath = swath_jit(points, HERE, jnp.full(91, -1), lines_of(capacity=1), none, none, Thresholds())
     for end, two in ((0.045, True), (0.025, False)):  # beams at y = 0 and 0.035
         line = jax.tree.map(lambda x: x[0], lines_of(([2.0, -0.01], [2.0, end])))
-        gone = passed_through(line, jnp.array(0), swath, HERE.cov, Thresholds(), SensorNoise())[2]
+        gone = passed_jit(line, jnp.array(0), swath, HERE.cov, Thresholds(), SensorNoise())[2]
         assert bool(gone.any()) == two
         assert bool(may_have_passed(line, jnp.array(0), swath, Thresholds())) == two

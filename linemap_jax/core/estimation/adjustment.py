@@ -101,7 +101,7 @@ def sightings_of_scan(
     return LineSightings(
         keyframe=jnp.broadcast_to(keyframe, slot.shape),
         line=slot,
-        anchor=jax.vmap(lambda at: rotate(-pose.mean[2], at))(foot),
+        anchor=rotate(-pose.mean[2], foot),
         angle=wrap_angle(found.lines.angle + turn),
         cov=with_sign(found.cov_measurement, sign),
         valid=found.lines.valid & (nis < thresholds.match_nis),

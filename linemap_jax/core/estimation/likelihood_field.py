@@ -133,7 +133,7 @@ def log_likelihood(
     Returns:
       The logarithm of a likelihood, but for a constant; never positive.
     """
-    turned = jax.vmap(lambda p: rotate(pose[2], p))(points)
+    turned = rotate(pose[2], points)
     squares = (distances(field, turned + pose[None, :2]) / sigma) ** 2
     return -0.5 * DISCOUNT * jnp.sum(jnp.where(valid, jnp.minimum(squares, WORST), 0))
 

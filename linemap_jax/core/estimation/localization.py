@@ -453,7 +453,7 @@ def _found(
         return search(field, points, valid, belief.mean, root, counts=counts)
 
     def explained(pose: Float[Array, "3"]) -> Float[Array, ""]:
-        turned = jax.vmap(lambda p: rotate(pose[2], p))(points) + pose[None, :2]
+        turned = rotate(pose[2], points) + pose[None, :2]
         near = valid & (distances(field, turned) < settings.explained_distance)
         return jnp.sum(near) / jnp.maximum(jnp.sum(valid), 1)
 
@@ -521,7 +521,7 @@ def place(lines: Lines, pose: Float[Array, "3"], cov: Float[Array, "3 3"]) -> tu
     Returns:
       The lines, with the pose error in `sqrt_persistent`; d(offset, angle) / d(x, y, theta), shape `[K, 2, 3]`.
     """
-    lever = jax.vmap(lambda a: rotate(pose[2], a))(lines.anchor)
+    lever = rotate(pose[2], lines.anchor)
     angle = wrap_angle(lines.angle + pose[2])
     placed = dataclasses.replace(lines, anchor=pose[None, :2] + lever, angle=angle, first_angle=angle)
     jac = jac_line_pose(placed, lever)
@@ -573,7 +573,7 @@ def sight_circles(
       A sighting for each circle of the scan; not valid for those that match none of the map.
     """
     circles = seen.circles
-    lever = jax.vmap(lambda a: rotate(pose[2], a))(circles.center)
+    lever = rotate(pose[2], circles.center)
     eye = jnp.broadcast_to(jnp.eye(2, dtype=lever.dtype), (lever.shape[0], 2, 2))
     jac = jnp.concatenate([eye, perp(lever)[:, :, None]], -1)
     ahead = unit(pose[2])
@@ -618,8 +618,8 @@ def sight_points(
     Returns:
       Sightings of lines of the map, by groups of points; not valid where there is no such group.
     """
-    towards = jax.vmap(lambda a: rotate(pose[2], a))(seen.beams)
-    points = pose[None, :2] + jax.vmap(lambda a: rotate(pose[2], a))(seen.points)
+    towards = rotate(pose[2], seen.beams)
+    points = pose[None, :2] + rotate(pose[2], seen.points)
     across, along, beside = _beside(points, model)
     slot, _ = least(jnp.where(model.valid[None], across**2 + beside**2, jnp.inf))
     across, along, beside = (jnp.take_along_axis(x, slot[:, None], 1)[:, 0] for x in (across, along, beside))
@@ -800,8 +800,8 @@ def fit_of_scan(
     points, valid = thinned(seen.points, seen.returned)
     ranges, _ = thinned(seen.ranges[:, None], seen.returned)
     beams, _ = thinned(seen.beams, seen.returned)
-    points = pose[None, :2] + jax.vmap(lambda a: rotate(pose[2], a))(points)
-    beams = jax.vmap(lambda a: rotate(pose[2], a))(beams)
+    points = pose[None, :2] + rotate(pose[2], points)
+    beams = rotate(pose[2], beams)
     explained = valid & (distances(field, points) < settings.explained_distance)
 
     back = (pose[:2] + rotate(pose[2], seen.laser))[None] - lines.anchor
