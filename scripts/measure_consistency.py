@@ -2,6 +2,8 @@
 
 Usage: python scripts/measure_consistency.py [--runs N] [--fused-runs N] [--devices N] [--only TABLE] [--write]
 
+Of one scan, of fifty whose association is known, of poles, and of whole maps as `linemap trials` makes them.
+
 The cells are those of `linemap_jax.lab.consistency.cells`: walls and rooms, two noises of the range, two of the
 bearing, three errors of the pose; 361 beams. Poles stand at 2 and 5 m. Whatever leaves its band is printed cell by
 cell. With --write each table goes into README, between its markers.
@@ -24,11 +26,13 @@ from readme import write_part
 from tqdm import tqdm
 
 from linemap_jax import preset
-from linemap_jax.core.settings import Persistence
+from linemap_jax.core.settings import Persistence, PoseError, Segmentation
 from linemap_jax.lab import consistency, consistency_of_circles
 from linemap_jax.lab.batch import mesh_of_devices, run_batch
 from linemap_jax.lab.consistency import Cell, Fit, Model, Sample, Verdict, judge
+from linemap_jax.lab.generators import changing_room
 from linemap_jax.lab.scanners import Scanner, sweep
+from linemap_jax.lab.trials import Conditions, Outcome, Trial, columns_of, summary, trial
 
 BATCH = 250
 """Runs that are simulated side by side; their arrays stay in the cache of a core."""
@@ -37,6 +41,16 @@ FUSED_NOISE = "; 0.01 m, 0.1 degree; "
 EVERY = 5
 """With the optimal segmentation every fifth cell is looked at: no divisor of the number of noises and poses, so that
 all of them occur."""
+SEGMENTATIONS: tuple[Segmentation, ...] = ("incremental", "optimal")
+OF_MAPS: tuple[tuple[float, PoseError, int], ...] = (
+    (0.0, "unknown", 1),
+    (0.0, "independent", 50),
+    (0.9, "persistent", 50),
+    (0.0, "unknown", 50),
+    (0.9, "unknown", 50),
+    (1.0, "unknown", 50),
+)
+"""Correlation of the pose errors, what the map builder knows of it, and the number of scans."""
 AFTER = (1, 5, 20, 50)
 CORRELATIONS = (0.0, 0.5, 0.9, 0.99, 1.0)
 
@@ -47,9 +61,12 @@ def main() -> int:
     parser.add_argument(
         "--runs", type=int, default=10_000, help="runs in each cell, of one scan; a fifth with `optimal`"
     )
-    parser.add_argument("--fused-runs", type=int, default=1_000, help="runs in each cell, of fifty scans")
+    parser.add_argument(
+        "--fused-runs", type=int, default=1_000, help="runs in each cell, of fifty scans; half with maps"
+    )
     parser.add_argument("--devices", type=int, default=2, help="processors to use")
-    parser.add_argument("--only", choices=("single", "optimal", "fused", "poles"), help="measure one of the tables")
+    tables = ("single", "optimal", "fused", "maps", "poles")
+    parser.add_argument("--only", choices=tables, help="measure one of the tables")
     parser.add_argument("--write", action="store_true", help="put the tables into README")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
@@ -58,6 +75,7 @@ def main() -> int:
         "single": (single_scans, options.runs),
         "optimal": (optimal_scans, options.runs // 5),
         "fused": (fused_scans, options.fused_runs),
+        "maps": (maps, options.fused_runs // 2),
         "poles": (poles, options.fused_runs),
     }
     for name, (measure, runs) in tables.items():
@@ -202,7 +220,8 @@ def fused_scans(runs: int) -> str:
     return "\n".join(
         [
             f"{len(cells)} cells with a pose error, e[k+1] = a e[k] + sqrt(1 - a^2) w, {runs} runs each; noise "
-            f"{FUSED_NOISE.strip('; ')}. Mean NEES of a line of the map after so many scans, least to largest cell; "
+            f"{FUSED_NOISE.strip('; ')}. Known points, and known which line is which: mean NEES of the fused line "
+            "after so many scans, least to largest cell; "
             f"the band is [{band.mean[0]:.3f}, {band.mean[1]:.3f}], [{band.inside[0]:.3f}, {band.inside[1]:.3f}].",
             "",
             f"| a | `pose_error` | {after} | inside 95 % | mean NIS | in band |",
@@ -215,6 +234,48 @@ def fused_scans(runs: int) -> str:
 def many_scans(key: jax.Array, cell: Cell, *, correlation: float, models: tuple[Model, ...]) -> Any:
     """NEES and NIS of fifty scans."""
     return consistency.fused(key, cell.world, cell.path, cell.scanner, cell.cov_pose, correlation, models)
+
+
+def maps(runs: int) -> str:
+    """Whole maps: nobody says which line is which, and things come and go."""
+    scanner = Scanner(bearings=sweep(-math.pi / 2, math.pi / 2, 361), range_sigma=0.02, bearing_sigma=0.0)
+    cov_pose = jnp.diag(jnp.array([0.01, 0.01, math.radians(0.1)])) ** 2
+    rows = []
+    for segmentation, (correlation, pose_error, scans) in itertools.product(SEGMENTATIONS, OF_MAPS):
+        persistence = Persistence(share=1.0, correlation=correlation)
+        experiment = partial(
+            one_map, scans=scans, pose_error=pose_error, persistence=persistence, segmentation=segmentation
+        )
+        name = f"{segmentation}, {pose_error}, a = {correlation}, {scans} scans"
+        print(name, file=sys.stderr)
+        conditions = Conditions(scanner=scanner, cov_pose=cov_pose, correlation=correlation)
+        score = summary(columns_of(run(experiment, "maps", conditions, runs)))
+        known = "-" if scans == 1 else pose_error
+        cells = (
+            segmentation,
+            str(scans),
+            str(correlation),
+            known,
+            f"{score['mean_nees']:.2f}",
+            f"{score['covered']:.3f}",
+        )
+        rows.append(f"| {' | '.join(cells)} | {score['lines']} |")
+    return "\n".join(
+        [
+            f"{runs} drives through rooms in which things come and go (`changing_room`), each of its own; 361 beams, "
+            "2 cm, no error of the bearing; poses 1 cm, 0.1 degree. The model of the pose error is the true one.",
+            "",
+            "| segmentation | scans | a | `pose_error` | mean NEES | inside 95 % | lines |",
+            "| --- | ---: | ---: | --- | ---: | ---: | ---: |",
+            *rows,
+        ]
+    )
+
+
+def one_map(key: jax.Array, conditions: Conditions, *, scans: int, **options: Any) -> Outcome:
+    """A drive through a world of its own."""
+    of_drive, of_world = jax.random.split(key)
+    return trial(Trial(key=of_drive, world=changing_room(of_world, scans=scans)), conditions, scans=scans, **options)
 
 
 def poles(runs: int) -> str:

@@ -42,7 +42,8 @@ def pytest_collection_finish() -> None:
     gc.freeze()
 
 
-LONGEST = (
+FIRST = (
+    "test_programs",  # empties the caches of its process
     "test_notebooks",
     "test_oracle",
     "test_cli",
@@ -55,12 +56,12 @@ LONGEST = (
     "test_trials",
     "test_readme",
 )
-"""Files that begin first, since the tests of one stay in one process: no other shall wait for it at the end."""
+"""Files that begin first: the longest, since the tests of one stay in one process. None shall be waited for at last."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The longest files first; else as they were."""
-    items.sort(key=lambda item: LONGEST.index(item.path.stem) if item.path.stem in LONGEST else len(LONGEST))
+    """Those files first; else as they were."""
+    items.sort(key=lambda item: FIRST.index(item.path.stem) if item.path.stem in FIRST else len(FIRST))
 
 
 @pytest.fixture

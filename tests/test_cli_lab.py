@@ -11,6 +11,7 @@ from typing import Any, get_args
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import shapely
@@ -25,6 +26,7 @@ from linemap_jax.io.carmen_writer import write_carmen
 from linemap_jax.io.config import read_config
 from linemap_jax.io.log import open_log
 from linemap_jax.io.map_file import write_map
+from linemap_jax.io.table import ResultsTable
 from linemap_jax.io.worlds import read_world
 
 SCANS = 6
@@ -333,10 +335,10 @@ def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("small_chunks")
-def test_trials_that_were_stopped_go_on_with_the_same_result(run, tmp_path: Path) -> None:
-    options = "--kind", "room", "--runs", 1, "--scans", 4, "--sweep", "match_nis", "--devices", 1
+def test_trials_that_were_stopped_or_were_fewer_go_on_with_the_same_result(run, monkeypatch, tmp_path: Path) -> None:
+    options = "--kind", "room", "--scans", 4, "--sweep", "match_nis", "--devices", 1
     args = "trials", "-o", tmp_path / "out", *options
-    status, out, err = run(*args)
+    status, out, err = run(*args, "--runs", 1)
     assert (status, err) == (0, "")
     assert "7 drives -> " in out
     parts = sorted((tmp_path / "out").glob("*.parquet"))
@@ -345,12 +347,17 @@ def test_trials_that_were_stopped_go_on_with_the_same_result(run, tmp_path: Path
     assert set(whole[0].column("walls").to_pylist()) <= {3, 4}  # of the room, with 180 degrees
     assert {row for part in whole for row in part.column("drive").to_pylist()} == {0}
 
-    # As if it had been killed after the first chunk
+    # As if it had been killed after the first chunk; and then there shall be more
     for part in parts[1:]:
         part.unlink()
-    status, out, err = run(*args, "--json")
-    assert (status, err) == (0, "")
-    assert [pq.read_table(part) for part in sorted((tmp_path / "out").glob("*.parquet"))] == whole
+    monkeypatch.setattr(trials, "PACE", 0.0)
+    status, out, err = run(*args, "--runs", 2, "--json")
+    assert status == 0
+    said = [f"2 of 14 drives are in {tmp_path}/out already", *(f"{n} of 14 drives" for n in range(4, 15, 2))]
+    assert err.splitlines() == [f"linemap: {sentence}" for sentence in said]
+    now = pq.read_table(tmp_path / "out")
+    assert now[:7] == pa.concat_tables(whole)
+    assert now.column("drive").to_pylist() == [0] * 7 + [1] * 7
     variants = json.loads(out)["variants"]
     assert [x["threshold"] for x in variants] == ["match_nis"] * 7
     assert [x["value"] for x in variants] == pytest.approx([9.21 * x for x in (0.25, 0.5, 0.7, 1, 1.4, 2, 4)])
@@ -367,6 +374,19 @@ def test_a_processor_stands_for_as_many_devices_as_are_asked_for(asked, hosts, o
     with contextlib.suppress(UsageError):  # the devices of this process are counted already
         trials.Trials(output=tmp_path, devices=asked, hosts=hosts)._mesh()
     assert told == {"jax_num_cpu_devices": of_cpu}
+
+
+def test_whoever_interrupts_trials_is_told_what_is_kept(run, monkeypatch, tmp_path: Path) -> None:
+    def work(_: trials.Trials) -> int:
+        table = ResultsTable(tmp_path, {})
+        table.append(0, {"drive": np.arange(3)})
+        with trials._interruptible(table, 7):
+            raise KeyboardInterrupt
+        raise AssertionError
+
+    monkeypatch.setattr(trials.Trials, "run", work)
+    kept = f"3 of 7 drives are in {tmp_path}; the same command goes on with the others"
+    assert run("trials", "-o", tmp_path) == (130, "", f"linemap: interrupted; {kept}\n")
 
 
 def test_trials_that_make_no_sense_are_refused(refuse, tmp_path: Path) -> None:

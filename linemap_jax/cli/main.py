@@ -94,8 +94,8 @@ def main(args: list[str] | None = None) -> int:
     except BrokenPipeError:  # whoever was reading has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except KeyboardInterrupt:
-        print("linemap: interrupted", file=sys.stderr)
+    except KeyboardInterrupt as interrupt:
+        print("; ".join(["linemap: interrupted", *map(str, interrupt.args)]), file=sys.stderr)
         return 130
 
 

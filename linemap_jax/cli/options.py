@@ -10,7 +10,7 @@ import tyro
 from linemap_jax.cli.compilations import keep_compilations
 
 if TYPE_CHECKING:
-    from linemap_jax.core.settings import SensorNoise
+    from linemap_jax.core.settings import Persistence, SensorNoise
 
 MOST_VERTICES = 1000
 """Of a budget: no scanner has more to say, and memory grows with it."""
@@ -110,14 +110,17 @@ def options_of_update(command: LogOptions) -> dict[str, Any]:
 
 
 def options_of_method(
-    name: Literal["default", "paper"], config: Path | None, noise: "SensorNoise | None" = None
+    name: Literal["default", "paper"],
+    config: Path | None,
+    noise: "SensorNoise | None" = None,
+    persistence: "Persistence | None" = None,
 ) -> dict[str, Any]:
-    """The preset with some noise, and the settings file over it; no noise where neither states it."""
+    """The preset with some noise and persistence, and the settings file over it; no noise where neither states it."""
     keep_compilations()
     from linemap_jax.core.settings import Persistence, SensorNoise, preset
     from linemap_jax.io.config import read_config
 
-    options: dict[str, Any] = {**preset(name), "noise": noise, "persistence": Persistence()}
+    options: dict[str, Any] = {**preset(name), "noise": noise, "persistence": persistence or Persistence()}
     for section, fields in (read_config(config) if config else {}).items():
         options[section] = dataclasses.replace(options[section] or SensorNoise(), **fields)
     return options

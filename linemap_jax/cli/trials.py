@@ -8,17 +8,20 @@ import os
 import socket
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from linemap_jax.cli.options import ScannerName, UsageError, check_drive, options_of_method
+from linemap_jax.cli.output import say
 from linemap_jax.cli.worlds import WorldKind, made_world
 
 if TYPE_CHECKING:
     from jax.sharding import Mesh
+
+    from linemap_jax.io.table import ResultsTable
 
 MOST_RUNS = 10**8
 """Of trials."""
@@ -32,16 +35,22 @@ CHUNK_RUNS = 256
 MOST_OF_CPU = 256
 """Devices that the processors of one machine are taken for, where more are asked for than there are processors."""
 
+PACE = 30.0
+"""Seconds from one word about the progress to the next, where it goes into a file."""
+
 LONGEST_WAIT = 60.0
 """Seconds that host 0 has to appear."""
 
-NO_MATTER = ("output", "devices", "hosts", "host", "coordinator", "quiet", "json")
-"""Options on which the results do not depend."""
+NO_MATTER = ("output", "runs", "devices", "hosts", "host", "coordinator", "quiet", "json")
+"""Options on which no row of the results depends."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Trials:
-    """Simulate, map and score many drives, each in a world of its own; a run that was stopped goes on."""
+    """Simulate, map and score many drives, each in a world of its own.
+
+    A run that was stopped goes on; one that is done goes on to more drives.
+    """
 
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="DIR")]
     """Folder for the results, a Parquet table with one row a drive. Goes on with one of the same trials."""
@@ -62,7 +71,7 @@ class Trials:
     pose_correlation: Annotated[float, tyro.conf.arg(metavar="A")] = 0.0
     """Of the pose errors, from one scan to the next: 0 for independent ones, 1 for one error that stays."""
     pose_error: Literal["independent", "persistent", "unknown"] = "unknown"
-    """What the map builder believes of that."""
+    """What the map builder believes of that; `persistent`: the truth, unless --config says else."""
     sweep: Annotated[tuple[str, ...], tyro.conf.arg(metavar="[NAME ...]")] = ()
     """Thresholds to vary, one at a time, in the same drives: each from a quarter to four times its value."""
     seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0
@@ -88,12 +97,14 @@ class Trials:
         if not 1 <= self.runs <= MOST_RUNS:
             raise UsageError(f"--runs must be from 1 to {MOST_RUNS}, not {self.runs}")
         self._check_hosts()
-        options = options_of_method(self.preset, self.config)
+        from linemap_jax.core.settings import Persistence
+
+        truth = Persistence(share=1.0, correlation=self.pose_correlation)
+        options = options_of_method(self.preset, self.config, persistence=truth)
         mesh = self._mesh()
         import jax
         import jax.numpy as jnp
         import numpy as np
-        from tqdm import tqdm
 
         from linemap_jax.io.table import ResultsTable
         from linemap_jax.lab.batch import run_chunks, told_by_the_first
@@ -125,40 +136,37 @@ class Trials:
             return trial(of_run, conditions, scans=self.scans, pose_error=self.pose_error, **options)
 
         batches = max(1, CHUNK_RUNS // (BATCH_RUNS * mesh.size))
-        chunk = BATCH_RUNS * batches * mesh.size
         told = {name: value for name, value in dataclasses.asdict(self).items() if name not in NO_MATTER}
         told |= {"config": self.config and self.config.read_text(encoding="utf-8")}
         table = ResultsTable(self.output, told) if self.host == 0 else None
         total, done = self.runs * len(varied), told_by_the_first(table.rows if table else 0)
-        if done % chunk and done < total:
-            raise UsageError(f"{self.output} holds {done} drives, which are no chunks of {chunk}: give --devices")
+        if done:
+            say(f"{min(done, total)} of {total} drives are in {self.output} already", quiet=self.quiet or self.host > 0)
         # All variants of one drive stand side by side.
         drive, variant = np.divmod(np.arange(total), len(varied))
         runs = {
-            "key": jax.random.split(jax.random.key(self.seed), self.runs)[drive],
-            "thresholds": jax.tree.map(lambda x: x[variant], variants),
+            "key": jax.random.split(jax.random.key(self.seed), self.runs)[drive[done:]],
+            "thresholds": jax.tree.map(lambda x: x[variant[done:]], variants),
         }
         started = time.perf_counter()
-        with tqdm(
-            total=total, initial=done, unit="drive", disable=True if self.quiet else None, file=sys.stderr
-        ) as progress:
-            common = (noise, conditions)
-            chunks = run_chunks(experiment, runs, *common, mesh=mesh, batch=BATCH_RUNS, batches=batches, start=done)
-            for first, rows in _until_lost(chunks, self.output) if done < total else ():
+        with _interruptible(table, total), _progress(total, done, quiet=self.quiet or table is None) as tell:
+            chunks = run_chunks(experiment, runs, noise, conditions, mesh=mesh, batch=BATCH_RUNS, batches=batches)
+            for begin, rows in _until_lost(chunks, self.output) if done < total else ():
                 if table is None:
                     continue
+                first = done + begin
                 here = slice(first, first + len(rows.lines))
                 which = [varied[i] for i in variant[here]]
                 columns: dict[str, Any] = {"drive": drive[here]}
                 if self.sweep:
                     columns |= {"threshold": [name for name, _ in which], "value": [value for _, value in which]}
                 table.append(first, columns | columns_of(rows))
-                progress.update(len(rows.lines))
+                tell(len(rows.lines))
         seconds = time.perf_counter() - started
         if table is None:
             return 0
-        results = table.read()
-        speed = {"seconds": seconds, "drives_per_second": (total - done) / seconds}
+        results = {name: column[:total] for name, column in table.read().items()}
+        speed = {"seconds": seconds, "drives_per_second": max(total - done, 0) / seconds}
         if self.sweep:
             of_variants = [
                 {name: column[i :: len(varied)] for name, column in results.items()} for i in range(len(varied))
@@ -232,6 +240,39 @@ class Trials:
         jax.distributed.initialize(self.coordinator, self.hosts, self.host)
 
 
+@contextlib.contextmanager
+def _progress(total: int, done: int, *, quiet: bool) -> Iterator[Callable[[int], object]]:
+    """To be told of drives that are done: a bar where somebody watches, else a line now and then."""
+    if quiet or sys.stderr.isatty():
+        from tqdm import tqdm
+
+        with tqdm(total=total, initial=min(done, total), unit="drive", disable=quiet, file=sys.stderr) as bar:
+            yield bar.update
+        return
+    told = time.monotonic()
+
+    def tell(count: int) -> None:
+        nonlocal done, told
+        done += count
+        if time.monotonic() - told >= PACE:
+            told = time.monotonic()
+            say(f"{done} of {total} drives", quiet=False)
+
+    yield tell
+
+
+@contextlib.contextmanager
+def _interruptible(table: "ResultsTable | None", total: int) -> Iterator[None]:
+    """Whoever interrupts is told what is kept."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        if table is not None:
+            kept = f"{table.rows} of {total} drives are in {table.folder}; the same command goes on with the others"
+            raise KeyboardInterrupt(kept) from None
+        raise
+
+
 def _until_lost(chunks: Iterator[Any], output: Path) -> Iterator[Any]:
     """The chunks, while all hosts are there."""
     from linemap_jax.lab.batch import LostProcess
@@ -268,7 +309,8 @@ def _trials_in_words(score: dict[str, Any]) -> str:
             f"{share('duplicates')} of {score['walls']} walls are held twice, {score['fragments']} pieces are too "
             f"many; {share('phantom_lines')} of {score['lines']} lines are phantoms",
             f"error {number('offset_rms_m', 100)} cm, {number('angle_rms_rad', 180 / math.pi)} degrees (rms); "
-            f"mean NEES {number('mean_nees')}, {share('covered')} inside the 95 % ellipse",
+            f"mean NEES {number('mean_nees')}, where 2 is exact and less is cautious; "
+            f"{share('covered')} inside the 95 % ellipse",
             f"{share('missed_poles')} of {score['poles']} poles are missed, {share('phantom_circles')} of "
             f"{score['circles']} circles are phantoms",
             f"matches: {share('false_matches')} false, {share('missed_matches')} missed of {score['matches']}",

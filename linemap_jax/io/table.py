@@ -50,8 +50,9 @@ class ResultsTable:
             self.folder.mkdir(parents=True, exist_ok=True)
             here = sorted(path.name for path in self.folder.iterdir() if not path.name.startswith("."))
             if ABOUT in here:
-                if (self.folder / ABOUT).read_bytes() != text.encode():
-                    raise TableError(f"{self.folder} holds the results of another experiment, see {ABOUT} in it")
+                there = (self.folder / ABOUT).read_bytes()
+                if there != text.encode():
+                    raise TableError(f"{self.folder} holds the results of another experiment, {_other(there, text)}")
             elif here:
                 raise TableError(f"{self.folder} is not empty and holds no table of results")
             else:
@@ -115,6 +116,17 @@ class ResultsTable:
             return {}
         whole = pa.concat_tables(parts)
         return {name: np.asarray(whole.column(name).to_pylist()) for name in whole.column_names}
+
+
+def _other(there: bytes, here: str) -> str:
+    """In what two descriptions of experiments differ."""
+    try:
+        before, now = json.loads(there), json.loads(here)
+        differing = [name for name in sorted({*before, *now}) if before.get(name) != now.get(name)]
+        told = ((name, *(json.dumps(x.get(name)) for x in (before, now))) for name in differing)
+        return printable("; ".join(f"{name} {old} there and {new} here" for name, old, new in told))
+    except (ValueError, TypeError, AttributeError):  # no JSON, or no table of names
+        return f"see {ABOUT} in it"
 
 
 def _told(error: Exception) -> str:

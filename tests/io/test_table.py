@@ -56,7 +56,7 @@ def test_a_full_disk_leaves_the_table_as_it_was(tmp_path, monkeypatch):
 def test_another_experiment_is_not_mixed_in(tmp_path):
     ResultsTable(tmp_path, ABOUT_IT)
     assert json.loads((tmp_path / ABOUT).read_text()) == ABOUT_IT
-    with pytest.raises(TableError, match="holds the results of another experiment"):
+    with pytest.raises(TableError, match="holds the results of another experiment, seed 3 there and 4 here$"):
         ResultsTable(tmp_path, ABOUT_IT | {"seed": 4})
 
 
