@@ -113,10 +113,10 @@ def test_nothing_is_compiled_twice(drive: Any, built: Any) -> None:
 
 
 def test_capacities_grow_and_nothing_is_lost(drive: Any, built: Any) -> None:
-    line_map, reports = build(*drive, map_capacity=Capacity(4, 1), capacity=Capacity(4, 8), chunk=CHUNK)
+    line_map, reports = build(*drive, map_capacity=Capacity(8, 1), capacity=Capacity(4, 8), chunk=CHUNK)
     large, expected = built
     k, c = line_map.lines.valid.shape[0], line_map.circles.valid.shape[0]
-    assert 4 < k <= 32
+    assert 8 < k <= 32
     assert c <= 16
     assert not large.lines.valid[k:].any()
     assert not large.circles.valid[c:].any()

@@ -91,14 +91,15 @@ def test_matches_are_judged_by_the_walls():
     scan, truth = simulate_scan(jax.random.key(0), world, pose, scanner)
     estimate = Pose(mean=pose, cov=COV_POSE)
     capacity = Capacity(8, 8)
-    line_map, _ = update(empty_map(capacity), scan, estimate, capacity=capacity)
-    found = extract(scan, estimate, capacity=capacity)
+    look = jax.jit(partial(update, capacity=capacity))
+    line_map, _ = look(empty_map(capacity), scan, estimate)
+    found = jax.jit(partial(extract, capacity=capacity))(scan, estimate)
     assert int(found.lines.valid.sum()) == 5  # the wall behind is cut where the sweep begins
 
     def judged(slots: jax.Array) -> tuple[int, ...]:
         return tuple(int(x) for x in judge_matches(line_map.lines, found, slots, world, truth))
 
-    matched = update(line_map, scan, estimate, capacity=capacity)[1].line_slot
+    matched = look(line_map, scan, estimate)[1].line_slot
     assert judged(matched) == (5, 0, 0)
     assert judged(jnp.full_like(matched, NEW)) == (0, 0, 5)
     wrong = jnp.where(matched >= 0, jnp.roll(matched, 2), matched)

@@ -285,7 +285,18 @@ def localize(
         expected = predict(belief, jnp.where(finite, move, 0), more, odometry)
         seen = observe(scan, mount, thresholds=thresholds, noise=noise, capacity=capacity, **method)
         moved = jnp.where(finite, jnp.sqrt(dot(move[:2], move[:2])), 0)
-        after, located = locate(expected, seen, moved, line_map, lines, field, thresholds, rules, noise, settings)
+        after, located = locate(
+            expected,
+            seen,
+            moved,
+            line_map,
+            lines,
+            field,
+            thresholds=thresholds,
+            rules=rules,
+            noise=noise,
+            settings=settings,
+        )
         status = located.status | jnp.where(finite, 0, int(Status.POSE_NOT_FINITE))
         after = jax.tree.map(lambda a, b: jnp.where(is_active, a, b), after, belief)
         return after, dataclasses.replace(located, status=status)
@@ -362,6 +373,7 @@ def locate(
     line_map: LineMap,
     lines: Lines,
     field: LikelihoodField,
+    *,
     thresholds: Thresholds,
     rules: Rules,
     noise: SensorNoise,
