@@ -13,6 +13,7 @@ from pathlib import Path
 from readme import write_part
 
 from linemap_jax.lab.verification import Row, as_markdown, as_text, citations, verify
+from linemap_jax.lab.verification.tables import label
 
 ROOT = Path(__file__).resolve().parents[1]
 OF_ALL = "test_verification::test_equation"
@@ -35,24 +36,33 @@ def part_of_readme(rows: Iterable[Row]) -> str:
     """What stands between the markers: the equations, and below them who cites them and where that is tested."""
     lines = [as_markdown(rows), "", "<details><summary>Equation, functions that cite it, tests of these</summary>", ""]
     lines += ["| equation | cited in | tested by |", "| --- | --- | --- |"]
-    for number, names in citations().items():
+    found = {str(number): names for number, names in citations().items()}
+    for row in rows:
+        names = found.get(row.equation, row.places)
         tests = sorted({test for name in names for test in tests_of(name)})
-        cited, tested = (", ".join(f"`{x}`" for x in several) for several in (names, [*tests, f"{OF_ALL}[{number}]"]))
-        lines.append(f"| ({number}) | {cited} | {tested} |")
+        several = names, [*tests, f"{OF_ALL}[{row.equation}]"]
+        cells = label(row), *(", ".join(f"`{x}`" for x in of_cell) for of_cell in several)
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join([*lines, "", "</details>"])
 
 
 def tests_of(name: str) -> Iterator[str]:
-    """File and name of each test that names what has this name in `core`, whose modules the tests mirror.
+    """File and name of each test that names what has this name in `core`, whose modules and packages the tests mirror.
 
     Or that names, or takes as a fixture, what the file makes of it: the same function compiled, or a helper around it.
     Whole modules are tested by nobody in particular.
     """
-    module, _, function = name.partition(".")
-    file = ROOT / f"tests/core/test_{module}.py"
-    body = ast.parse(file.read_text(encoding="utf-8")).body if file.exists() else []
+    *within, function = name.split(".")
+    files = [ROOT / f"tests/core/test_{module}.py" for module in within]
+    for file in files:
+        if file.exists():
+            yield from _tests_in(file, function)
+
+
+def _tests_in(file: Path, function: str) -> Iterator[str]:
+    body = ast.parse(file.read_text(encoding="utf-8")).body
     tests = [item for item in body if isinstance(item, ast.FunctionDef) and item.name.startswith("test_")]
-    meant = {function.rpartition(".")[2]}
+    meant = {function}
     for item in body:
         if isinstance(item, ast.Assign) and meant & names_in(item.value):
             meant |= names_in(*item.targets)

@@ -20,8 +20,7 @@ class Verify:
         keep_compilations()
         from linemap_jax.lab.verification import as_dict, as_text, verify
 
-        if sys.stderr.isatty():
-            print("linemap: compiles for some 20 s, the first time", file=sys.stderr)
+        print("linemap: compiles for half a minute, the first time", file=sys.stderr)
         rows = verify()
         if self.json:
             print(json.dumps([as_dict(row) for row in rows], indent=2))

@@ -506,7 +506,7 @@ def bands(runs: int, cells: int = 1, *, error: float = 0.001, dof: int = 2) -> B
     k = runs * dof
     low, high = (k * (1 - 2 / (9 * k) + s * z * math.sqrt(2 / (9 * k))) ** 3 / runs for s in (-1, 1))
     spread = z * math.sqrt(0.05 * 0.95 / runs)
-    return Bands((low, high), (0.95 - spread, 0.95 + spread))
+    return Bands((low, high), (0.95 - spread, min(0.95 + spread, 1.0)))
 
 
 def holds(verdict: Verdict, band: Bands) -> bool:
