@@ -70,14 +70,17 @@ def main(args: list[str] | None = None) -> int:
     if args and (unknown := _unknown(args[0])):
         print(f"linemap: {unknown}", file=sys.stderr)
         return 2
-    with NUMBERS:
-        command = tyro.cli(
-            Command,
-            prog="linemap",
-            description=DESCRIPTION,
-            config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
-            args=args,
-        )
+    try:
+        with NUMBERS:
+            command = tyro.cli(
+                Command,
+                prog="linemap",
+                description=DESCRIPTION,
+                config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
+                args=args,
+            )
+    except BrokenPipeError:
+        return _nobody_reads()
     # What follows loads jax, which takes a second: not before the options are known to be right.
     from linemap_jax.io.atomic import OutputError
     from linemap_jax.io.config import ConfigError
@@ -91,12 +94,17 @@ def main(args: list[str] | None = None) -> int:
     except (LogError, OutputError, MapFileError, TableError, WorldFileError, ConfigError, UsageError) as error:
         print(f"linemap: {error}", file=sys.stderr)
         return 2
-    except BrokenPipeError:  # whoever was reading has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
+    except BrokenPipeError:
+        return _nobody_reads()
     except KeyboardInterrupt as interrupt:
         print("; ".join(["linemap: interrupted", *map(str, interrupt.args)]), file=sys.stderr)
         return 130
+
+
+def _nobody_reads() -> int:
+    """The exit status after whoever was reading has seen enough."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return 1
 
 
 def _unknown(word: str) -> str:

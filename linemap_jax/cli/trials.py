@@ -140,8 +140,12 @@ class Trials:
         told |= {"config": self.config and self.config.read_text(encoding="utf-8")}
         table = ResultsTable(self.output, told) if self.host == 0 else None
         total, done = self.runs * len(varied), told_by_the_first(table.rows if table else 0)
+        quiet = self.quiet or self.host > 0
         if done:
-            say(f"{min(done, total)} of {total} drives are in {self.output} already", quiet=self.quiet or self.host > 0)
+            say(f"{min(done, total)} of {total} drives are in {self.output} already", quiet=quiet)
+        if done < total:
+            size, kind = BATCH_RUNS * batches * mesh.size, mesh.devices.flat[0].platform
+            say(f"compiles for {mesh.size} devices ({kind}), and writes every {size} drives", quiet=quiet)
         # All variants of one drive stand side by side.
         drive, variant = np.divmod(np.arange(total), len(varied))
         runs = {
@@ -268,7 +272,7 @@ def _interruptible(table: "ResultsTable | None", total: int) -> Iterator[None]:
         yield
     except KeyboardInterrupt:
         if table is not None:
-            kept = f"{table.rows} of {total} drives are in {table.folder}; the same command goes on with the others"
+            kept = f"{table.rows} of {total} drives are in {table.folder}; the same command goes on from there"
             raise KeyboardInterrupt(kept) from None
         raise
 
@@ -309,7 +313,7 @@ def _trials_in_words(score: dict[str, Any]) -> str:
             f"{share('duplicates')} of {score['walls']} walls are held twice, {score['fragments']} pieces are too "
             f"many; {share('phantom_lines')} of {score['lines']} lines are phantoms",
             f"error {number('offset_rms_m', 100)} cm, {number('angle_rms_rad', 180 / math.pi)} degrees (rms); "
-            f"mean NEES {number('mean_nees')}, where 2 is exact and less is cautious; "
+            f"mean NEES {number('mean_nees')} +- {number('mean_nees_error')}, where 2 is exact and less is cautious; "
             f"{share('covered')} inside the 95 % ellipse",
             f"{share('missed_poles')} of {score['poles']} poles are missed, {share('phantom_circles')} of "
             f"{score['circles']} circles are phantoms",

@@ -106,10 +106,12 @@ class Persistence:
     """How the pose error goes on from scan to scan, for `pose_error="persistent"`.
 
     The pose error is the sum of a part that is new in every scan and a part that persists and drifts: in units of its
-    sigma, u[k+1] = correlation u[k] + sqrt(1 - correlation^2) w. What persists is the same (dx, dy, dtheta), in the axes
-    of the world, added to one pose after the other. A map that is turned as a whole, as by a wrong pose at the start, and
-    the drift of odometry move the positions too, and more so the farther the robot drives: they are no such error, and
-    the covariances come out far too small. "unknown" holds for them.
+    sigma, u[k+1] = correlation u[k] + sqrt(1 - correlation^2) w.
+
+    What persists is the same (dx, dy, dtheta), in the axes of the world, added to one pose after the other. A map that
+    is turned as a whole, as by a wrong pose at the start, and the drift of odometry move the positions too, and more so
+    the farther the robot drives: they are no such error, and the covariances come out far too small. "unknown" holds
+    for them.
     """
 
     share: Number = 1.0

@@ -110,7 +110,9 @@ def _magic(path: str | os.PathLike[str]) -> bytes | None:
         if stat.S_ISDIR(found.st_mode):
             if (Path(path) / "metadata.yaml").exists():
                 return None
-            raise LogError(path, "is a directory, not a log, nor a ROS 2 bag with its metadata.yaml")
+            inside = sorted(file.name for file in Path(path).iterdir() if file.suffix in (".mcap", ".db3"))
+            hint = f"; it holds {inside[0]}, which can be given by itself" if inside else ""
+            raise LogError(path, f"is a directory, not a log, nor a ROS 2 bag with its metadata.yaml{hint}")
         if not stat.S_ISREG(found.st_mode):
             raise LogError(path, "is not a regular file")
         if found.st_size == 0:

@@ -295,6 +295,11 @@ def summary(columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
         return float(total[part] / total[whole]) if total[whole] > 0 else None
 
     on_walls = int(total["lines_on_walls"])
+    # Lines of one drive err alike; so the error of the ratio is taken over drives.
+    nees_error = None
+    if on_walls:
+        off = columns["nees"] - total["nees"] / on_walls * columns["lines_on_walls"]
+        nees_error = float(np.sqrt(np.sum(np.square(off))) / on_walls)
     offset, angle = np.sqrt(total["square_error"] / on_walls).tolist() if on_walls else (None, None)
     matches = int(total["true_matches"] + total["false_matches"] + total["missed_matches"])
     return {
@@ -309,6 +314,7 @@ def summary(columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
         "offset_rms_m": offset,
         "angle_rms_rad": angle,
         "mean_nees": share("nees", "lines_on_walls"),
+        "mean_nees_error": nees_error,
         "covered": share("covered", "lines_on_walls"),
         "poles": int(total["poles"]),
         "missed_poles": share("missed_poles", "poles"),

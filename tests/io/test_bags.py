@@ -301,6 +301,16 @@ def test_poses_of_the_user_go_before_those_of_the_log(tmp_path):
     assert readings[0].cov_pose is None
     assert readings[0].mount == pytest.approx((0.2, 0.1, 0.1))
     assert (notes.poses, notes.without_pose, notes.drift) == ("of a given trajectory", 1, None)
+    # A sweep that begins by the last pose may end a step later; stamps are rounded.
+    assert trajectory.covers(100.1 - 5e-7, 100.4)
+    assert not trajectory.covers(100.0, 100.4)
+    assert trajectory.covers(100.4 + 5e-7, 100.7)
+    assert not trajectory.covers(100.4, 100.71)
+    assert not trajectory.covers(100.41, 100.5)
+    np.testing.assert_allclose(trajectory.at(np.array([100.5]))[0, :2], [5, 0])
+    alone = Trajectory(np.array([100.0]), np.ones((1, 3)))
+    assert alone.covers(100.0, 100.0)
+    assert not alone.covers(100.0, 100.1)
     # Those of the laser are where it is, wherever it sits on the robot.
     readings, notes = read(path, poses=Trajectory(trajectory.stamps, trajectory.poses, "laser"))
     assert (readings[0].pose_frame, readings[0].mount) == ("laser", (0, 0, 0))
