@@ -339,7 +339,7 @@ def test_trials_that_were_stopped_or_were_fewer_go_on_with_the_same_result(run, 
     options = "--kind", "room", "--scans", 4, "--sweep", "match_nis", "--devices", 1
     args = "trials", "-o", tmp_path / "out", *options
     status, out, err = run(*args, "--runs", 1)
-    assert (status, err) == (0, "linemap: compiles for 1 devices (cpu), and writes every 2 drives\n")
+    assert (status, err) == (0, "linemap: compiles for 1 device (cpu), and writes every 2 drives\n")
     assert "7 drives -> " in out
     parts = sorted((tmp_path / "out").glob("*.parquet"))
     whole = [pq.read_table(part) for part in parts]
@@ -353,7 +353,7 @@ def test_trials_that_were_stopped_or_were_fewer_go_on_with_the_same_result(run, 
     monkeypatch.setattr(trials, "PACE", 0.0)
     status, out, err = run(*args, "--runs", 2, "--json")
     assert status == 0
-    said = [f"2 of 14 drives are in {tmp_path}/out already", "compiles for 1 devices (cpu), and writes every 2 drives"]
+    said = [f"2 of 14 drives are in {tmp_path}/out already", "compiles for 1 device (cpu), and writes every 2 drives"]
     said += [f"{n} of 14 drives" for n in range(4, 15, 2)]
     assert err.splitlines() == [f"linemap: {sentence}" for sentence in said]
     now = pq.read_table(tmp_path / "out")

@@ -135,17 +135,17 @@ class Trials:
             )
             return trial(of_run, conditions, scans=self.scans, pose_error=self.pose_error, **options)
 
-        batches = max(1, CHUNK_RUNS // (BATCH_RUNS * mesh.size))
         told = {name: value for name, value in dataclasses.asdict(self).items() if name not in NO_MATTER}
         told |= {"config": self.config and self.config.read_text(encoding="utf-8")}
         table = ResultsTable(self.output, told) if self.host == 0 else None
         total, done = self.runs * len(varied), told_by_the_first(table.rows if table else 0)
+        batches = max(1, min(CHUNK_RUNS, total - done) // (BATCH_RUNS * mesh.size))
         quiet = self.quiet or self.host > 0
         if done:
             say(f"{min(done, total)} of {total} drives are in {self.output} already", quiet=quiet)
         if done < total:
-            size, kind = BATCH_RUNS * batches * mesh.size, mesh.devices.flat[0].platform
-            say(f"compiles for {mesh.size} devices ({kind}), and writes every {size} drives", quiet=quiet)
+            devices = f"{mesh.size} {'device' if mesh.size == 1 else 'devices'} ({mesh.devices.flat[0].platform})"
+            say(f"compiles for {devices}, and writes every {BATCH_RUNS * batches * mesh.size} drives", quiet=quiet)
         # All variants of one drive stand side by side.
         drive, variant = np.divmod(np.arange(total), len(varied))
         runs = {
