@@ -1872,9 +1872,8 @@ def update(
         lines,
         found,
         pairs,
-        apex,
+        sweep,
         report,
-        view=Viewpoint(sweep.p, sweep.cov_pose),
         thresholds=thresholds,
         rules=rules,
         pose_error=pose_error,
@@ -1924,24 +1923,22 @@ def _lines_at_once(
     lines: Lines,
     found: Extraction,
     pairs: list[Gates],
-    apex: np.ndarray,
+    sweep: Sweep,
     report: Report,
     *,
-    view: Viewpoint,
     thresholds: Any,
     rules: Any,
     pose_error: PoseError,
     share: float,
     ties: Margin,
 ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
-    """Match all new lines against the map as it stood, then fuse and add. `apex` is for the other order.
+    """Match all new lines against the map as it stood, then fuse and add.
 
     Returns:
       For each new line the slot that it went into and the slot that it was suspected to be (-1: none), and no
       triangles: they are drawn later.
     """
-    del apex
-    n = len(found.lines.offset)
+    n, view = len(found.lines.offset), Viewpoint(sweep.p, sweep.cov_pose)
     new, slots = forget(found.lines, share), np.flatnonzero(lines.valid)
     matching = {"thresholds": thresholds, "pose_error": pose_error, "ties": ties}
     matches = [match_line(new.take(i), lines, slots, **matching) for i in range(n)]
@@ -1982,10 +1979,9 @@ def _lines_one_by_one(
     lines: Lines,
     found: Extraction,
     pairs: list[Gates],
-    apex: np.ndarray,
+    sweep: Sweep,
     report: Report,
     *,
-    view: Viewpoint,
     thresholds: Any,
     rules: Any,
     pose_error: PoseError,
@@ -2001,7 +1997,7 @@ def _lines_one_by_one(
       For each new line the slot that it went into and the slot that it was suspected to be (-1: none, or that line is
       gone again), and the triangles that have wiped.
     """
-    n = len(found.lines.offset)
+    n, view = len(found.lines.offset), Viewpoint(sweep.p, sweep.cov_pose)
     new = forget(found.lines, share)
     targets, suspects = np.full(n, -1), np.full(n, -1)
     triangles: list[np.ndarray] = []
@@ -2037,7 +2033,7 @@ def _lines_one_by_one(
             report.added += 1
         if rules.wipe_by_beams:
             continue
-        triangle = wipe_triangle(lines.take(targets[i]), apex, thresholds=thresholds)
+        triangle = wipe_triangle(lines.take(targets[i]), sweep.p + sweep.laser, thresholds=thresholds)
         if triangle is None:
             continue
         triangles.append(triangle)

@@ -175,3 +175,19 @@ def test_map_is_that_of_the_oracle_slot_by_slot(log: str, name: str, pose_error:
     np.testing.assert_allclose(mine.circles.cov[kept], theirs.circles.cov[kept], atol=1e-8)
     np.testing.assert_array_equal(mine.circles.fitted[kept], theirs.circles.fitted[kept])
     np.testing.assert_array_equal(mine.circles.times_detected[kept], theirs.circles.times_detected[kept])
+
+
+@pytest.mark.parametrize("name", ["default", "paper"])
+def test_line_by_line_the_map_is_nearly_the_same(name: str) -> None:
+    """The paper takes the lines of a scan one after the other; that is told from scripts/compare_with_oracle.py."""
+    scans, poses = filled("intel", slice(30))
+    options = oracle_options(preset(name)) | {"pose_error": "unknown", "persistence": PERSISTENCE}
+    at_once, one_by_one = oracle.empty_map(MAP), oracle.empty_map(MAP)
+    for t in range(30):
+        scan, pose = one(scans, t), one(poses, t)
+        seen = fields(scan), pose.mean, pose.cov
+        at_once, _ = oracle.update(at_once, *seen, scan_capacity=SCAN, **options)
+        one_by_one, _ = oracle.update(one_by_one, *seen, scan_capacity=SCAN, mode="sequential", **options)
+    counts = [int(line_map.lines.valid.sum()) for line_map in (at_once, one_by_one)]
+    assert min(counts) > 10
+    assert counts[0] == pytest.approx(counts[1], rel=0.2)
