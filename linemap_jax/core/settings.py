@@ -214,33 +214,46 @@ class Method(TypedDict, total=False):
     """The keyword arguments of `extract` that say how it reads a scan. Static: each decides which program it is."""
 
     rules: Rules
+    """Which reading of the method."""
     segmentation: Segmentation
+    """How points are divided into lines."""
     max_vertices: int | None
+    """Of "optimal": the budget of end points."""
     covariance: Covariance
+    """Exact, or as printed."""
     jacobians: Jacobians
+    """By hand, or by autodiff."""
 
 
 class ExtractOptions(Method, total=False):
     """The keyword arguments of `extract`, but for the capacity."""
 
     thresholds: Thresholds | None
+    """Where the method draws its lines."""
     noise: SensorNoise | None
+    """Of the sensor."""
     mount: Mount | None
+    """Of the scanner on the robot."""
 
 
 class UpdateOptions(ExtractOptions, total=False):
     """The keyword arguments of `update`, but for the capacity."""
 
     pose_error: PoseError
+    """How the errors of the poses of several scans hang together."""
     persistence: Persistence | None
+    """For "persistent"."""
 
 
 class Preset(TypedDict):
     """The keyword arguments of `extract` and `update` that make up a preset."""
 
     thresholds: Thresholds
+    """Where the method draws its lines."""
     rules: Rules
+    """Which reading of it."""
     covariance: Covariance
+    """Exact, or as printed."""
 
 
 def preset(name: Literal["default", "paper"]) -> Preset:
