@@ -427,6 +427,20 @@ def test_a_folder_is_not_a_log(refuse, tmp_path):
     assert refuse("build", tmp_path, "-o", tmp_path / "out") == (
         f"{tmp_path}: is a directory, not a log, nor a ROS 2 bag with its metadata.yaml"
     )
+    (tmp_path / "drive_0.mcap").touch()
+    assert refuse("build", tmp_path, "-o", tmp_path / "out").endswith(
+        "its metadata.yaml; it holds drive_0.mcap, which can be given by itself"
+    )
+
+
+def test_help_that_nobody_reads_ends_quietly():
+    read, write = os.pipe()
+    os.close(read)
+    done = subprocess.run(
+        [sys.executable, "-m", "linemap_jax.cli", "build", "--help"], stdout=write, stderr=subprocess.PIPE, check=False
+    )
+    os.close(write)
+    assert (done.returncode, done.stderr) == (1, b"")
 
 
 def test_the_output_folder_is_a_file(refuse, log, tmp_path):

@@ -99,8 +99,8 @@ class Trials:
         self._check_hosts()
         from linemap_jax.core.settings import Persistence
 
-        truth = Persistence(share=1.0, correlation=self.pose_correlation)
-        options = options_of_method(self.preset, self.config, persistence=truth)
+        of_errors = Persistence(share=1.0, correlation=self.pose_correlation)
+        options = options_of_method(self.preset, self.config, persistence=of_errors)
         mesh = self._mesh()
         import jax
         import jax.numpy as jnp

@@ -147,15 +147,15 @@ class Trajectory:
         self.stamps, index = np.unique(stamps, return_index=True)
         self.poses = poses[index]
         self.poses[:, 2] = np.unwrap(self.poses[:, 2])
-        beyond = slice(-1, None) if self.stamps.size > 1 else slice(0)
-        self._knots = np.append(self.stamps, self.stamps[beyond] + np.diff(self.stamps[-2:]))
-        self._poses_at_knots = np.concatenate([self.poses, self.poses[beyond] + np.diff(self.poses[-2:], axis=0)])
+        # One step more, if there is a step.
+        self._knots = np.append(self.stamps, self.stamps[-1] + np.diff(self.stamps[-2:]))
+        self._poses_at_knots = np.concatenate([self.poses, self.poses[-1] + np.diff(self.poses[-2:], axis=0)])
 
     def covers(self, begin: float, end: float) -> bool:
         """Whether the poses from one stamp to another are known. s.
 
         A trajectory may have one pose for each scan, at its begin. So what begins by the last of them may end a step
-        later: as long the robot goes on as it did.
+        later: for so long the robot goes on as it did.
         """
         in_time = self.stamps[0] - ROUNDED <= begin <= self.stamps[-1] + ROUNDED
         return bool(in_time and end <= self._knots[-1] + ROUNDED)

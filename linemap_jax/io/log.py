@@ -7,7 +7,7 @@ from pathlib import Path
 
 from linemap_jax.io import carmen
 from linemap_jax.io.frames import Poses, Trajectory
-from linemap_jax.io.reading import Log, LogError, Options, Progress
+from linemap_jax.io.reading import Log, LogError, Options, Progress, printable
 
 _BAGS = (b"#ROSBAG", b"\x89MCAP", b"SQLite format 3\0")
 
@@ -111,7 +111,7 @@ def _magic(path: str | os.PathLike[str]) -> bytes | None:
             if (Path(path) / "metadata.yaml").exists():
                 return None
             inside = sorted(file.name for file in Path(path).iterdir() if file.suffix in (".mcap", ".db3"))
-            hint = f"; it holds {inside[0]}, which can be given by itself" if inside else ""
+            hint = f"; it holds {printable(inside[0])}, which can be given by itself" if inside else ""
             raise LogError(path, f"is a directory, not a log, nor a ROS 2 bag with its metadata.yaml{hint}")
         if not stat.S_ISREG(found.st_mode):
             raise LogError(path, "is not a regular file")

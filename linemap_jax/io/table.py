@@ -124,9 +124,10 @@ def _other(there: bytes, here: str) -> str:
         before, now = json.loads(there), json.loads(here)
         differing = [name for name in sorted({*before, *now}) if before.get(name) != now.get(name)]
         told = ((name, *(json.dumps(x.get(name)) for x in (before, now))) for name in differing)
-        return printable("; ".join(f"{name} {old} there and {new} here" for name, old, new in told))
-    except (ValueError, TypeError, AttributeError):  # no JSON, or no table of names
-        return f"see {ABOUT} in it"
+        said = "; ".join(f"{name} {old} there and {new} here" for name, old, new in told)
+    except (ValueError, TypeError, AttributeError, RecursionError):  # no JSON, or no table of names
+        said = ""
+    return printable(said) or f"see {ABOUT} in it"
 
 
 def _told(error: Exception) -> str:

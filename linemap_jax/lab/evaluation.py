@@ -65,8 +65,6 @@ def explained_share(
     mount: Mount | None = None,
     *,
     chunk: int,
-    within: float | Array = 0.1,
-    closer_than: float | Array = 20.0,
 ) -> float:
     """The share of returns that lie on a primitive of the map, over a log that comes piece by piece.
 
@@ -75,8 +73,6 @@ def explained_share(
       chunks: stacked scans and poses, at most `chunk` of them each time.
       mount: of the scanner on the robot.
       chunk: size to which pieces are filled up.
-      within: of a primitive, m.
-      closer_than: only returns nearer than this count, m.
 
     Returns:
       A number in [0, 1]; 0 where no return counts.
@@ -84,7 +80,7 @@ def explained_share(
     line_map = _without_free_slots(line_map)
     hits = total = 0
     for scans, poses in _filled(chunks, chunk):
-        h, t = explained(line_map, scans, poses, mount, within=within, closer_than=closer_than)
+        h, t = explained(line_map, scans, poses, mount)
         hits, total = hits + int(h), total + int(t)
     return hits / total if total else 0.0
 

@@ -310,6 +310,19 @@ def test_reanchor_leaves_the_line_where_it_is(lines: Lines) -> None:
     np.testing.assert_allclose(back.sqrt_persistent, lines.sqrt_persistent, rtol=1e-8, atol=1e-12)
 
 
+@pytest.mark.parametrize(("first", "last", "keeps_from"), [(16, 32, 21), (12, 32, 21), (4, 26, 4)])
+def test_a_line_that_began_on_the_wall_beside_leaves_its_points_out(first: int, last: int, keeps_from: int) -> None:
+    """At a corner as below, which the second run passes at point 20; unless less than a third of the run were left."""
+    bearings = np.radians(np.arange(-20.0, 21.0))
+    scan = Scan.from_ranges(3 / (np.cos(bearings) + np.abs(np.sin(bearings))), bearings)
+    points = points_from_scan(scan, Pose(mean=jnp.zeros(3), cov=jnp.zeros((3, 3))), Mount(), jacobians="analytic")
+    noise, rules = SensorNoise(range_sigma=0.02, bearing_sigma=0.0), Rules(leave_out_sparse=False)
+    choose = jax.jit(choose_points, static_argnames="rules")
+    found = choose(points, runs_at(41, (0, first - 1), (first, last)), Thresholds(), noise, rules=rules)
+    np.testing.assert_array_equal(np.flatnonzero(np.asarray(found.of_point) == 1), range(keeps_from, last + 1))
+    assert found.valid[1]
+
+
 def test_points_that_noise_may_have_brought_from_the_wall_beside_are_left_out() -> None:
     """At a right-angled corner 3 m ahead: those within 3 sigma of the line of the other wall, on both sides."""
     bearings = np.radians(np.arange(-20.0, 21.0))

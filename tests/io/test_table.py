@@ -103,10 +103,11 @@ def test_a_chunk_of_other_rows_than_its_name_says_is_noticed(tmp_path):
         table.read()
 
 
-def test_a_description_that_is_no_text_is_that_of_another_experiment(tmp_path):
+@pytest.mark.parametrize("content", [b"\xff\xfe", b"[" * 100_000, b"7", json.dumps(ABOUT_IT).encode()])
+def test_a_description_that_is_another_text_is_that_of_another_experiment(tmp_path, content):
     ResultsTable(tmp_path, ABOUT_IT)
-    (tmp_path / ABOUT).write_bytes(b"\xff\xfe")
-    with pytest.raises(TableError, match="another experiment"):
+    (tmp_path / ABOUT).write_bytes(content)
+    with pytest.raises(TableError, match=f"another experiment, see {ABOUT} in it$"):
         ResultsTable(tmp_path, ABOUT_IT)
 
 

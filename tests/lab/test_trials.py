@@ -124,6 +124,17 @@ def test_mistakes_are_shares_of_what_there_was():
     assert not whole[:, [0, 3, 4, 5, 6]].any()
 
 
+def test_the_error_of_the_mean_nees_is_that_over_drives():
+    """As the scatter of the mean itself says, where the lines of one drive err alike."""
+    rng = np.random.default_rng(2)
+    lines = rng.integers(5, 15, (4000, 100)).astype(float)
+    nees = lines * rng.exponential(2.0, lines.shape)
+    made = drives(rng, 100, 0.9) | {"square_error": np.zeros((100, 2))}
+    scores = [summary(made | {"nees": n, "lines_on_walls": k}) for n, k in zip(nees, lines, strict=True)]
+    means, errors = (np.array([score[name] for score in scores]) for name in ("mean_nees", "mean_nees_error"))
+    assert errors.mean() == pytest.approx(means.std(), rel=0.1)
+
+
 def test_a_value_is_recommended_where_it_is_surely_better():
     rng = np.random.default_rng(1)
     present = FACTORS.index(1.0)
