@@ -603,6 +603,40 @@ def without_sparse(
     return result
 
 
+def without_strange_ends(
+    sweep: Sweep, runs: list[list[int]], kept: list[list[int]], thresholds: Any, margin: Margin
+) -> list[list[int]]:
+    """The points of each run without a first or last one that criterion 2 would turn away from the line of the others.
+
+    Args:
+      sweep: the valid beams.
+      runs: those that are lines, each a list of positions in the sweep.
+      kept: of each run the points that have not been left out before.
+      thresholds: of criterion 2.
+      margin: notes how clear the decisions were.
+    """
+    result = []
+    for run, mine in zip(runs, kept, strict=True):
+        line = regression(sweep.o[run])
+        u, w = sweep.o[run].T[::-1] if line.steep else sweep.o[run].T
+        normal = np.array([math.cos(line.angle), math.sin(line.angle)])
+        strange = []
+        for end in (0, len(run) - 1):
+            others = np.delete(np.arange(len(run)), end)
+            spread = u[others] - u[others].mean()
+            slope = (spread @ w[others]) / (spread @ spread)
+            lever = u[end] - u[others].mean()
+            distance = abs(w[end] - w[others].mean() - slope * lever) / math.hypot(1, line.slope)
+            cos2 = float(normal @ sweep.u[run[end]]) ** 2
+            variance = sweep.sr**2 * cos2 + (sweep.r[run[end]] * sweep.sa) ** 2 * (1 - cos2)
+            variance *= 1 + 1 / len(others) + lever**2 / (spread @ spread)
+            gate = max(float(thresholds.line_distance), float(thresholds.line_sigmas) * math.sqrt(variance))
+            if margin.below(gate, float(distance)):
+                strange.append(run[end])
+        result.append([i for i in mine if i not in strange])
+    return result
+
+
 def _are_enough(count: int, run: list[int]) -> bool:
     """Whether so many of the points of a run make a line."""
     return count >= 3 and 3 * count >= len(run)
@@ -949,6 +983,8 @@ def extract(
     kept_points = without_corners(sweep, of_lines, margin) if rules.leave_out_corners else of_lines
     if rules.leave_out_sparse:
         kept_points = without_sparse(sweep, of_lines, kept_points, thresholds, margin)
+    if rules.check_ends:
+        kept_points = without_strange_ends(sweep, of_lines, kept_points, thresholds, margin)
     found = []
     for run, points in zip(of_lines, kept_points, strict=True):
         if _are_enough(len(points), run):

@@ -311,22 +311,22 @@ def line_extent(
 
 
 def choose_points(points: Points, runs: Runs, thresholds: Thresholds, noise: SensorNoise, rules: Rules) -> Runs:
-    """The runs with the points that the fit should use, by `leave_out_corners` and `leave_out_sparse`.
+    """The runs with the points that the fit should use, by `leave_out_corners`, `leave_out_sparse` and `check_ends`.
 
     A choice that depends on the noise of the points it makes biases what is fitted to them. So it is made by where the
-    line of the run, and the lines beside it, say that the points are.
+    line of the run, and the lines beside it, say that the points are; or by a gate that noise alone hardly ever passes.
 
     Args:
       points: the points of the scan.
       runs: the runs that are lines, in the order of the sweep.
-      thresholds: criterion 1.
+      thresholds: criteria 1 and 2.
       noise: of the sensor.
       rules: which points are left out.
 
     Returns:
       The runs; not valid where less than a third of the points, or fewer than three, are left.
     """
-    if not (rules.leave_out_corners or rules.leave_out_sparse):
+    if not (rules.leave_out_corners or rules.leave_out_sparse or rules.check_ends):
         return runs
     fit = regress(points.position, runs)
     length2 = jnp.maximum(dot(fit.direction, fit.direction), 1)
@@ -336,6 +336,8 @@ def choose_points(points: Points, runs: Runs, thresholds: Thresholds, noise: Sen
         kept &= ~_at_corners(points, runs, normal, fit.origin + fit.centroid, fit.count, noise)
     if rules.leave_out_sparse:
         kept &= ~_sparse(points, runs.spread(normal), thresholds, noise)
+    if rules.check_ends:
+        kept &= ~_strange_ends(points, runs, fit, normal, thresholds, noise)
     count = runs.sum(kept.astype(fit.count.dtype))
     valid = runs.valid & (count >= MIN_POINTS) & (count >= LEAST_SHARE * fit.count)
     return dataclasses.replace(runs, of_point=jnp.where(kept, runs.of_point, -1), valid=valid)
@@ -392,6 +394,34 @@ def _sparse(
     sway = (points.range * noise.bearing_sigma) ** 2 * (1 - cosine2) / cosine2
     unsure = UNSURE_SIGMAS * jnp.sqrt(2 * (noise.range_sigma**2 + sway))
     return arc / jnp.sqrt(cosine2) + unsure >= gap_gate(arc, thresholds, noise)
+
+
+def _strange_ends(
+    points: Points,
+    runs: Runs,
+    fit: Regression,
+    normal: Float[Array, "K 2"],
+    thresholds: Thresholds,
+    noise: SensorNoise,
+) -> Bool[Array, " N"]:
+    """The first and last points of the runs that do not lie on the line of the other points.
+
+    The first three points of a run join it unseen, and the gate of criterion 2 is wide while a line is short: a point
+    of another thing may begin it. Here criterion 2 holds it against all the others. The distance d of a point of
+    leverage h becomes d / (1 - h) if the line does without that point, and its variance the noise's by 1 / (1 - h).
+    """
+    strange = jnp.zeros(runs.of_point.shape, bool)
+    for at in (runs.first, runs.last):
+        from_middle = points.position[at] - fit.origin - fit.centroid
+        u, _ = _regressor_first(from_middle, fit.steep)
+        rest = jnp.maximum(1 - 1 / fit.count - fit.count * u * u / jnp.where(fit.width > 0, fit.width, 1), 0)
+        along_beam = dot(normal, points.beam[at]) ** 2
+        across_beam = (points.range[at] * noise.bearing_sigma) ** 2
+        variance = across_beam + (noise.range_sigma**2 - across_beam) * along_beam
+        gate = jnp.maximum(thresholds.line_distance**2 * rest**2, thresholds.line_sigmas**2 * variance * rest)
+        out = runs.valid & (dot(normal, from_middle) ** 2 > gate)
+        strange = strange.at[jnp.where(out, at, strange.shape[0])].set(True, mode="drop")
+    return strange
 
 
 def length_of_run(run: Run, position: Float[Array, "N 2"]) -> Float[Array, " N"]:

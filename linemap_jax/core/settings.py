@@ -170,6 +170,9 @@ class Rules:
     leave_out_sparse: bool = True
     """Points so far apart that noise decides whether criterion 1 holds take no part in the fit: where a wall is seen at
     a grazing angle, only those that noise has moved together would make up a line."""
+    check_ends: bool = True
+    """The first and last point of a run take no part in the fit where criterion 2 does not hold between them and the
+    line of the others: the first three points of a run make its line, whatever they are."""
     fit_circles: bool = True
     """Fit a circle to a cluster where there are points enough. Eqs. (18)-(20) describe the visible arc: a centre that
     lies before the pole's and moves with the viewpoint."""

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from linemap_jax.core.extract import extract
 from linemap_jax.core.frames import reanchor
 from linemap_jax.core.lines import (
     choose_points,
@@ -316,7 +317,7 @@ def test_a_line_that_began_on_the_wall_beside_leaves_its_points_out(first: int, 
     bearings = np.radians(np.arange(-20.0, 21.0))
     scan = Scan.from_ranges(3 / (np.cos(bearings) + np.abs(np.sin(bearings))), bearings)
     points = points_from_scan(scan, Pose(mean=jnp.zeros(3), cov=jnp.zeros((3, 3))), Mount(), jacobians="analytic")
-    noise, rules = SensorNoise(range_sigma=0.02, bearing_sigma=0.0), Rules(leave_out_sparse=False)
+    noise, rules = SensorNoise(range_sigma=0.02, bearing_sigma=0.0), Rules(leave_out_sparse=False, check_ends=False)
     choose = jax.jit(choose_points, static_argnames="rules")
     found = choose(points, runs_at(41, (0, first - 1), (first, last)), Thresholds(), noise, rules=rules)
     np.testing.assert_array_equal(np.flatnonzero(np.asarray(found.of_point) == 1), range(keeps_from, last + 1))
@@ -337,3 +338,38 @@ def test_points_that_noise_may_have_brought_from_the_wall_beside_are_left_out() 
     unsure = beside < 3 * 0.05 * np.cos(np.pi / 4 + np.abs(bearings))
     assert np.flatnonzero(unsure).tolist() == [19, 20, 21]
     np.testing.assert_array_equal(np.asarray(kept.of_point) < 0, unsure)
+
+
+@pytest.mark.parametrize("moved", [None, 0, 6])
+@pytest.mark.parametrize("off", [0.05, 0.12])
+def test_a_point_at_the_end_that_the_others_disagree_with_is_left_out(moved: int | None, off: float) -> None:
+    """A wall 10 m ahead, seen with seven points; by 5 sigma of a prediction from six, which is 8 to 9 cm."""
+    bearings = np.radians(np.arange(-3.0, 4.0))
+    ranges = 10 / np.cos(bearings)
+    if moved is not None:
+        ranges[moved] += off
+    here = Pose(mean=jnp.zeros(3), cov=jnp.zeros((3, 3)))
+    points = points_from_scan(Scan.from_ranges(ranges, bearings), here, Mount(), jacobians="analytic")
+    sigma = 0.012
+    choose = jax.jit(choose_points, static_argnames="rules")
+    found = choose(
+        points, runs_at(7, (0, 6)), Thresholds(), SensorNoise(range_sigma=sigma, bearing_sigma=0.0), rules=Rules()
+    )
+    others = np.delete(np.arange(7), moved or 0)
+    u = 10 * np.tan(bearings)
+    predicted = sigma * np.sqrt(
+        1 + 1 / 6 + (u[moved or 0] - u[others].mean()) ** 2 / np.sum((u[others] - u[others].mean()) ** 2)
+    )
+    assert 0.05 < 5 * predicted < 0.12
+    left_out = [moved] if moved is not None and off > 5 * predicted else []
+    np.testing.assert_array_equal(np.flatnonzero(np.asarray(found.of_point) < 0), left_out)
+
+
+def test_three_points_of_two_walls_are_no_line() -> None:
+    """Nothing but three points, the first of a wall that stands across: the other two alone are too few for a line."""
+    bearings = np.radians([-3.0, 0.0, 3.0])
+    for off, rule, a_line in ((0.0, True, True), (0.3, False, True), (0.3, True, False)):
+        scan = Scan.from_ranges(10 / np.cos(bearings) - np.array([off, 0, 0]), bearings)
+        rules = Rules(leave_out_sparse=False, check_ends=rule)
+        found = extract(scan, Pose(mean=jnp.zeros(3), cov=jnp.zeros((3, 3))), rules=rules)
+        assert bool(found.lines.valid[0]) == a_line
