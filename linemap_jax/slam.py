@@ -18,9 +18,15 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from linemap_jax.build import STATIC, build
-from linemap_jax.core.estimation.adjustment import LineSightings, adjust, sightings_of_scan, with_error_of_poses
+from linemap_jax.core.estimation.adjustment import (
+    LineSightings,
+    adjust,
+    sightings_of_scan,
+    with_error_of_first,
+    with_error_of_poses,
+)
 from linemap_jax.core.estimation.loops import Closure, LoopSettings, close_loop
-from linemap_jax.core.estimation.odometry import OdometryNoise
+from linemap_jax.core.estimation.odometry import OdometryNoise, cov_step
 from linemap_jax.core.estimation.pose_graph import SURE, Closures, PoseGraph, cov_of_registration, optimise
 from linemap_jax.core.estimation.registration import RegistrationSettings
 from linemap_jax.core.estimation.surface import Surface, middle_of
@@ -57,6 +63,7 @@ SIGMA_MAP = (0.05, 0.05, 0.01)
 SIGMA_SCAN = (0.01, 0.01, 0.003)
 """m, m, rad. By how much the registration of a single scan errs."""
 
+_AT_ONCE = np.zeros(3)  # how the scanner moves in a scan of one instant
 _START = 512  # keyframes that there is room for at first
 _LEAST_INFORMATION = np.diag([1.0, 1.0, 10.0])  # of a closure, beside its points: 1 m, 0.3 rad
 
@@ -70,6 +77,7 @@ class _Keyframes:
     middle: list[np.ndarray] = dataclasses.field(default_factory=list)  # [2] of what it sees, in its own frame
     surface: list[Surface] = dataclasses.field(default_factory=list)
     scan: list[Scan] = dataclasses.field(default_factory=list)
+    odometry: list[np.ndarray] = dataclasses.field(default_factory=list)  # [3] pose by odometry
 
 
 class Slam:
@@ -95,6 +103,7 @@ class Slam:
           registration: of scans onto what has been seen.
           loops: which closures are looked for and believed.
         """
+        self._noise = odometry_noise
         self._track = partial(_jit_track, noise=odometry_noise, settings=tracking, registration=registration)
         self._loops = loops
         self._close = partial(_jit_close, settings=loops, registration=registration)
@@ -106,15 +115,18 @@ class Slam:
         self._weight = np.zeros(0)
         self._keyframe_of_scan: list[np.ndarray] = []
         self._seen_from_keyframe: list[np.ndarray] = []
+        self._swept: list[np.ndarray] = []
         self.shares: list[np.ndarray] = []
         self.unit_variance = 1.0
 
-    def add(self, scans: Scan, odometry: ArrayLike) -> None:
+    def add(self, scans: Scan, odometry: ArrayLike, swept: ArrayLike = _AT_ONCE) -> None:
         """Go on by some scans.
 
         Args:
           scans: at most `CHUNK`, stacked.
           odometry: poses of the scanner by the robot's odometry. m, m, rad. Shape `[T, 3]`.
+          swept: how the scanner moved, by the same, while it swept: the pose at the last beam seen from that at the
+            first, to which the scan is brought. Nothing for scans of one instant. m, m, rad. Shape `[T, 3]`.
         """
         count, counted = scans.ranges.shape[0], np.asarray(odometry, float)
         if self._state is None:
@@ -128,12 +140,13 @@ class Slam:
         )
         said = jax.tree.map(lambda x: np.asarray(x)[:count], said)
         self.shares.append(said.share)
+        self._swept.append(np.broadcast_to(np.asarray(swept, float), (count, 3)))
         begin = len(self._keyframes.step)
-        self._take(said, jax.tree.map(np.asarray, scans))
+        self._take(said, jax.tree.map(np.asarray, scans), counted)
         if self._close_loops(begin):
             self._optimise()
 
-    def _take(self, said: Tracked, scans: Scan) -> None:
+    def _take(self, said: Tracked, scans: Scan, odometry: np.ndarray) -> None:
         """Keep the keyframes of a chunk, and where its scans lie against them."""
         kept = self._keyframes
         prior = np.diag([1 / 0.3**2, 1 / 0.3**2, 1 / 0.15**2])  # what odometry says at least, over one step
@@ -148,6 +161,7 @@ class Slam:
                 kept.middle.append(middles[i])
                 kept.surface.append(jax.tree.map(lambda x, i=i: x[i], said.surface))
                 kept.scan.append(jax.tree.map(lambda x, i=i: x[i], scans))
+                kept.odometry.append(odometry[i])
                 pose = self._first if first else compose(self._poses[-1], kept.step[-1])
                 self._poses = np.concatenate([self._poses, pose[None]])
             else:
@@ -257,11 +271,12 @@ class Slam:
         count, dtype = len(self._poses), line_map.lines.offset.dtype
         numbers, pieces = np.arange(count), []
         width = max(scan.ranges.size for scan in self._keyframes.scan)
+        cov_sweeps = self._cov_of_sweeps()[self.scan_of_keyframe]
         for i in range(0, count, CHUNK):
             scans = _stacked(self._keyframes.scan[i : i + CHUNK], width)
             size = len(scans.ranges)
             poses = _uncertain(self._poses[i : i + CHUNK], SIGMA_NEXT, dtype)
-            piece = pad_stack((scans, poses, jnp.asarray(numbers[i : i + CHUNK])), CHUNK)
+            piece = pad_stack((scans, poses, numbers[i : i + CHUNK], cov_sweeps[i : i + CHUNK]), CHUNK)
             seen = _jit_sightings(*piece, line_map.lines, thresholds=thresholds, noise=noise, **method)
             pieces.append(jax.tree.map(partial(_flat, size), seen))
         valid = np.concatenate([piece.valid for piece in pieces])
@@ -281,9 +296,10 @@ class Slam:
             )
             lines = jax.tree.map(lambda x: _filled(np.asarray(x)[used], k, x.shape[1:], _wide(x.dtype)), line_map.lines)
             done = _jit_adjust(self.graph(_tight), lines, sightings)
+            done = _jit_error_of_first(done, _turned(cov_sweeps[:1], self._poses[:1, 2])[0])
         self._poses = np.asarray(done.poses)[:count]
         self.unit_variance = float(done.unit_variance)
-        covs = np.asarray(done.cov_poses)[:count]
+        covs = np.asarray(done.cov_poses)[:count] + _turned(cov_sweeps, self._poses[:, 2])
         moved = jax.tree.map(
             lambda old, new: jnp.asarray(_put(np.asarray(old), used, np.asarray(new)[: len(used)]), old.dtype),
             line_map.lines,
@@ -293,6 +309,36 @@ class Slam:
         moved = dataclasses.replace(line_map, lines=moved)
         with jax.enable_x64(True):
             return _jit_error_of_poses(moved, seen, self._poses, covs), covs
+
+    def drift(self, stamps: Float[np.ndarray, " T"]) -> Float[np.ndarray, "T 3"]:
+        """How fast odometry goes astray at each scan, by the trajectory so far: evenly from keyframe to keyframe.
+
+        While a scanner sweeps, its beams are brought together by odometry alone. The trajectory knows better.
+
+        Args:
+          stamps: of the scans, s. Shape `[T]`.
+
+        Returns:
+          The velocity of the scanner, in its own frame, that odometry lacks; zero after the last keyframe. m/s, m/s,
+          rad/s. Shape `[T, 3]`.
+        """
+        counted = np.array(self._keyframes.odometry)
+        astray = between(between(counted[:-1], counted[1:]), between(self._poses[:-1], self._poses[1:]))
+        seconds = np.diff(stamps[self.scan_of_keyframe])[:, None]
+        rate = np.where(seconds > 0, astray / np.where(seconds > 0, seconds, 1), 0)
+        return np.concatenate([rate, np.zeros((1, 3))])[np.concatenate(self._keyframe_of_scan)]
+
+    def see_again(self, begin: int, scans: Scan) -> None:
+        """Take some scans anew, for `adjust`, now that it is known how the scanner moved in their sweeps.
+
+        Args:
+          begin: number of the first.
+          scans: stacked.
+        """
+        seen = jax.tree.map(np.asarray, scans)
+        for keyframe, number in enumerate(self.scan_of_keyframe - begin):
+            if 0 <= number < len(seen.ranges):
+                self._keyframes.scan[keyframe] = jax.tree.map(lambda x, i=number: x[i], seen)
 
     @property
     def closures(self) -> int:
@@ -317,7 +363,7 @@ class Slam:
     def cov_trajectory(self, cov_keyframes: Float[np.ndarray, "N 3 3"]) -> Float[np.ndarray, "T 3 3"]:
         """Covariances of these, from those of the keyframes; m^2, m rad, rad^2.
 
-        A scan between two keyframes errs as the one before it, and by its own registration.
+        A scan between two keyframes errs as the one before it, by its own registration, and by odometry in its sweep.
 
         Args:
           cov_keyframes: of their poses, from `adjust`: m^2, m rad, rad^2. Shape `[N, 3, 3]`.
@@ -331,8 +377,30 @@ class Slam:
         jac[:, 0, 2] = -np.sin(theta) * seen[:, 0] - np.cos(theta) * seen[:, 1]
         jac[:, 1, 2] = np.cos(theta) * seen[:, 0] - np.sin(theta) * seen[:, 1]
         between_keyframes = (seen != 0).any(1)[:, None, None]
-        own = between_keyframes * np.diag(np.square(SIGMA_SCAN))
+        of_sweep = _turned(self._cov_of_sweeps(), theta + seen[:, 2])
+        own = between_keyframes * (np.diag(np.square(SIGMA_SCAN)) + of_sweep)
         return jac @ cov_keyframes[owner] @ np.swapaxes(jac, 1, 2) + own
+
+    def _cov_of_sweeps(self) -> Float[np.ndarray, "T 3 3"]:
+        """What each scan, as a whole, errs by, since odometry brought its beams to the pose of the first one.
+
+        Odometry errs at random along the way, and on the mean over a sweep by a third of the variance that it has at
+        the end; by as much the parts of a sweep differ from its mean, at most. It errs as the noise says, but for
+        factors along x, y and theta: those by which it fits the trajectory from keyframe to keyframe, but for what is
+        in proportion to the motion, which `drift` holds. In the frame of the scanner.
+        """
+        swept = np.concatenate(self._swept)
+        if not swept.any():
+            return np.zeros((len(swept), 3, 3))
+        counted = np.array(self._keyframes.odometry)
+        steps = between(counted[:-1], counted[1:])
+        with jax.enable_x64(True):
+            said, in_sweep = (np.asarray(_jit_cov_steps(x, self._noise)) for x in (steps, swept))
+        astray = between(steps, between(self._poses[:-1], self._poses[1:]))
+        rest = astray - steps @ np.linalg.lstsq(steps, astray)[0]
+        variance = np.sum(np.diagonal(said, axis1=1, axis2=2), 0) * max(1 - 3 / max(len(steps), 1), 0.1)
+        factor = np.sqrt(np.sum(rest**2, 0) / np.where(variance > 0, variance, 1) / 3)
+        return in_sweep * factor[:, None] * factor
 
 
 @documented
@@ -418,7 +486,9 @@ _jit_track = jax.jit(track_chunk)
 _jit_close = jax.jit(close_loop)
 _jit_optimise = jax.jit(optimise)
 _jit_adjust = jax.jit(adjust)
+_jit_cov_steps = jax.jit(jax.vmap(cov_step, (0, None)))
 _jit_cov = jax.jit(cov_of_registration)
+_jit_error_of_first = jax.jit(with_error_of_first)
 _jit_error_of_poses = jax.jit(with_error_of_poses)
 _jit_middles = jax.jit(jax.vmap(middle_of))
 
@@ -428,16 +498,18 @@ def _jit_sightings(
     scans: Scan,
     poses: Pose,
     numbers: Array,
+    cov_sweeps: Array,
     lines: Lines,
     *,
     thresholds: Thresholds,
     noise: SensorNoise,
     **method: Unpack[Method],
 ) -> LineSightings:
-    def of_scan(x: tuple[Scan, Pose, Array]) -> LineSightings:
-        return sightings_of_scan(*x[:2], lines, x[2], thresholds=thresholds, noise=noise, **method)
+    def of_scan(x: tuple[Scan, Pose, Array, Array]) -> LineSightings:
+        scan, pose, number, cov_sweep = x
+        return sightings_of_scan(scan, pose, lines, number, cov_sweep, thresholds=thresholds, noise=noise, **method)
 
-    return jax.lax.map(of_scan, (scans, poses, numbers))
+    return jax.lax.map(of_scan, (scans, poses, numbers, cov_sweeps.astype(scans.ranges.dtype)))
 
 
 def _cov_of_registration(information: Any, share: Any, prior: np.ndarray) -> np.ndarray:
@@ -478,6 +550,14 @@ def _room(count: int) -> int:
 def _tight(count: int) -> int:
     """The next multiple of 128: time grows with the cube of it."""
     return 128 * max(1, -(-count // 128))
+
+
+def _turned(cov: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Covariances of poses in axes that are turned by an angle. Shape `[N, 3, 3]`."""
+    turn = np.tile(np.eye(3), (len(cov), 1, 1))
+    c, s = np.cos(angle), np.sin(angle)
+    turn[:, 0, 0], turn[:, 0, 1], turn[:, 1, 0], turn[:, 1, 1] = c, -s, s, c
+    return turn @ cov @ np.swapaxes(turn, 1, 2)
 
 
 def _filled(values: Any, size: int, shape: tuple[int, ...], dtype: Any = float, *, fill: Any = 0) -> Array:

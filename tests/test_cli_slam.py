@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from bags import Recording, heading
 
 from linemap_jax.cli import main
 from linemap_jax.cli.evaluate import Evaluate
@@ -109,6 +110,71 @@ def test_a_drive_around_a_block(drive: Drive, run: Callable[..., Any], tmp_path:
     longest = np.flatnonzero(outer)[np.argmax(np.asarray(line_map.lines.length)[outer])]
     y = np.asarray(line_map.lines.begin)[longest, 1]
     assert abs(y + 7.0) < 4 * math.sqrt(np.asarray(line_map.lines.cov)[longest, 0, 0]) + 0.01
+
+
+def seen_from(x: float, y: float, theta: float) -> float:
+    """How far it is along one beam to the wall of a room of 9 m by 6 m with a corner built in."""
+    corners = np.array([[-4.0, -3.0], [5.0, -3.0], [5.0, 1.0], [3.0, 1.0], [3.0, 3.0], [-4.0, 3.0]])
+    along, off = np.roll(corners, -1, 0) - corners, corners - [x, y]
+    ahead = np.array([math.cos(theta), math.sin(theta)])
+    det = ahead[0] * along[:, 1] - ahead[1] * along[:, 0]
+    reach = (off[:, 0] * along[:, 1] - off[:, 1] * along[:, 0]) / det
+    share = (off[:, 0] * ahead[1] - off[:, 1] * ahead[0]) / det
+    return reach[(reach > 0) & (share >= 0) & (share <= 1)].min()
+
+
+def test_a_scanner_that_sweeps_on_wheels_that_count_wrong(run: Callable[..., Any], tmp_path: Path) -> None:
+    """They count a tenth too much, so that by them each sweep is bent; the trajectory knows better."""
+    random, recording = np.random.default_rng(2), Recording()
+    scans, seconds, mount = 90, 0.25, np.array([0.2, 0.1, 0.3])
+
+    def driven(time: float, scale: float = 1.0) -> np.ndarray:
+        """A turn to the left and one to the right, from rest; x, y are those of an arc of 0.8 m."""
+        turned = scale * 2.5 * (1 - math.cos(2 * math.pi * max(time, 0.0) / (scans * seconds)))
+        return np.array([0.8 * math.sin(turned), 0.8 * (1 - math.cos(turned)), turned])
+
+    recording.tf(99.0, "base_link", "laser", (*mount[:2], 0), heading(mount[2]), static=True)
+    for i in range(20 * scans):
+        recording.odometry(99.5 + seconds * i / 20, tuple(driven(seconds * i / 20 - 0.5, 1.1)))
+    bearings = np.deg2rad(np.arange(181) - 90.0)
+    truth = []
+    for i in range(scans - 3):
+        at = [laser_at(driven(seconds * i + 0.1 * beam / 181), mount) for beam in range(181)]
+        ranges = [
+            seen_from(x, y, theta + bearing) + random.normal(0, 0.01)
+            for (x, y, theta), bearing in zip(at, bearings, strict=True)
+        ]
+        truth.append(at[0])
+        recording.scan(
+            100.0 + seconds * i,
+            ranges,
+            angle_min=bearings[0],
+            angle_max=bearings[-1],
+            angle_increment=bearings[1] - bearings[0],
+            time_increment=0.1 / 181,
+        )
+    log = recording.write(tmp_path)
+    status, _, _ = run("slam", log, "-o", tmp_path / "out", "--range-sigma", 0.01, "--bearing-sigma", 1e-5)
+    assert status == 0
+    table = np.loadtxt(tmp_path / "out" / "trajectory.csv", delimiter=",", skiprows=1)
+    off = table[:, 1:4] - np.array(truth)
+    off[:, 2] = np.angle(np.exp(1j * off[:, 2]))
+    rate = np.gradient(np.array(truth)[:, 2], seconds)
+    turning = (np.abs(rate) > 0.6) & (table[:, 4] < 0.01**2)  # keyframes; between them scans have 1 cm of their own
+    assert turning.sum() > 10
+    # Uncorrected, the mean beam of a sweep would turn a scan by 0.1 x 0.6 rad/s x 0.05 s, 3 mrad.
+    assert abs(np.mean((off[:, 2] * np.sign(rate))[turning])) < 0.0015
+    cov = np.zeros((len(table), 3, 3))
+    cov[:, *np.triu_indices(3)] = table[:, 4:10]
+    cov += np.swapaxes(np.triu(cov, 1), 1, 2)
+    values = np.einsum("ti,tij,tj->t", off[turning], np.linalg.inv(cov[turning]), off[turning])
+    assert values.mean() < 8
+
+
+def laser_at(robot: np.ndarray, mount: np.ndarray) -> np.ndarray:
+    x, y, theta = robot
+    c, s = math.cos(theta), math.sin(theta)
+    return np.array([x + c * mount[0] - s * mount[1], y + s * mount[0] + c * mount[1], theta + mount[2]])
 
 
 def test_the_log_of_a_map_is_read_at_the_poses_that_slam_found(tmp_path: Path, capsys: Any) -> None:

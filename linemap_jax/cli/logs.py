@@ -63,14 +63,15 @@ def mount_of_odometry(command: LogInput, log: "Log") -> "Mount":
     return Mount(*(command.laser_offset or next(iter(log)).mount or (0.0, 0.0, 0.0)))
 
 
-def chunks_of_log(command: LogOptions, log: "Log", size: int) -> Iterator["Chunk"]:
-    """Scans and poses as the options want them."""
+def chunks_of_log(command: LogOptions, log: "Log", size: int, drift: "np.ndarray | None" = None) -> Iterator["Chunk"]:
+    """Scans and poses as the options want them; their sweeps with a drift beside the poses' motion, if there is one."""
     import numpy as np
 
-    from linemap_jax.io.scans import chunks_of_readings
+    from linemap_jax.io.scans import chunks_of_readings, with_drift
 
     cov_pose = np.diag(np.square(command.pose_sigma))
-    return chunks_of_readings(log, size, cov_pose=cov_pose, every=command.every, dtype=command.dtype)
+    readings = log if drift is None else with_drift(log, drift, command.every)
+    return chunks_of_readings(readings, size, cov_pose=cov_pose, every=command.every, dtype=command.dtype)
 
 
 def odometry_of(command: LogOptions, chunk: "Chunk") -> "np.ndarray":

@@ -61,9 +61,10 @@ class Slam(LogOptions):
 
         say("the trajectory stands; mapping", quiet=self.quiet)
         at_laser = options | {"mount": Mount()}
-        again = opened(self, self.log)
+        again, drift = opened(self, self.log), _of_robot(slammed.drift(stamps), mount)
         with progress(again, quiet=self.quiet):
-            mapped = map_of_pieces(_at_poses(self, again, slammed.trajectory()), at_laser)
+            pieces = _seen_again(slammed, _at_poses(self, again, slammed.trajectory(), drift))
+            mapped = map_of_pieces(pieces, at_laser)
         of_map = ("mount", "persistence", "pose_error")
         of_extract = {name: option for name, option in options.items() if name not in of_map}
         line_map, cov_keyframes = slammed.adjust(mapped.line_map, **of_extract)
@@ -96,7 +97,7 @@ class Slam(LogOptions):
             print(f"linemap: interrupted; map and trajectory so far are in {self.output}", file=sys.stderr)
             return 130
         pace = _pace(stamps, seconds, to_first + mapped.seconds[0][0])
-        summary = _summary(self, slammed, line_map, trajectory, files) | pace
+        summary = _summary(self, slammed, line_map, trajectory, drift, files) | pace
         print(json.dumps(summary, indent=2) if self.json else _in_words(summary))
         return 0
 
@@ -106,7 +107,7 @@ def _tracked(command: Slam, log: "Log", mount: "Mount") -> tuple["Slammed", "np.
     import numpy as np
 
     from linemap_jax import slam
-    from linemap_jax.core.frames_on_host import compose
+    from linemap_jax.core.frames_on_host import between, compose
 
     slammed, stamps, to_first, interrupted = slam.Slam(), [], 0.0, False
     started = time.perf_counter()
@@ -119,7 +120,8 @@ def _tracked(command: Slam, log: "Log", mount: "Mount") -> tuple["Slammed", "np.
                     f"{log.path}: has scans without odometry; --standstill does without, --poses takes it from a file"
                 )
             stamps.append(chunk.timestamps)
-            slammed.add(chunk.scans, compose(odometry, on_robot))
+            last_beam = between(on_robot, compose(chunk.last_beam, on_robot))
+            slammed.add(chunk.scans, compose(odometry, on_robot), last_beam)
             to_first = to_first or time.perf_counter() - started
     except KeyboardInterrupt:
         if len(slammed.keyframes) == 0:
@@ -130,22 +132,43 @@ def _tracked(command: Slam, log: "Log", mount: "Mount") -> tuple["Slammed", "np.
 
 
 def _at_poses(
-    command: LogOptions, log: "Log", trajectory: "np.ndarray", every: int = 1
+    command: LogOptions, log: "Log", trajectory: "np.ndarray", drift: "np.ndarray", every: int = 1
 ) -> Iterator[tuple["Scan", "Pose"]]:
-    """The scans of the log, as far as the trajectory goes, at its poses."""
+    """The scans of the log, as far as the trajectory goes, at its poses; swept as odometry has it, and its drift."""
     import jax
 
     from linemap_jax.build import CHUNK
     from linemap_jax.slam import poses_for_map
 
     begin = 0
-    for chunk in chunks_of_log(dataclasses.replace(command, every=command.every * every), log, CHUNK):
+    seldom = dataclasses.replace(command, every=command.every * every)
+    for chunk in chunks_of_log(seldom, log, CHUNK, drift[::every]):
         poses = trajectory[begin * every :: every][: len(chunk.timestamps)]
         begin += len(poses)
         if not len(poses):
             return
         scans = jax.tree.map(partial(_first, len(poses)), chunk.scans)
         yield scans, poses_for_map(poses, scans.ranges.dtype)
+
+
+def _seen_again(slammed: "Slammed", pieces: Iterator[tuple["Scan", "Pose"]]) -> Iterator[tuple["Scan", "Pose"]]:
+    """The pieces; the keyframes take their scans from them."""
+    begin = 0
+    for scans, poses in pieces:
+        slammed.see_again(begin, scans)
+        begin += len(scans.ranges)
+        yield scans, poses
+
+
+def _of_robot(velocity: "np.ndarray", mount: "Mount") -> "np.ndarray":
+    """The velocity of the robot, in its own frame, that carries the laser at the given one. Shape `[T, 3]`."""
+    import numpy as np
+
+    from linemap_jax.core.frames_on_host import compose
+
+    turned = compose([0.0, 0.0, float(mount.theta)], velocity)[:, :2]
+    way = velocity[:, 2:] * np.array([mount.y, -mount.x], float)
+    return np.concatenate([turned + way, velocity[:, 2:]], -1)
 
 
 def _first(count: int, x: Any) -> Any:
@@ -204,7 +227,12 @@ def _pace(stamps: "np.ndarray", seconds: float, to_first: float) -> dict[str, fl
 
 
 def _summary(
-    command: Slam, slammed: "Slammed", line_map: "LineMap", trajectory: "np.ndarray", files: list[Path]
+    command: Slam,
+    slammed: "Slammed",
+    line_map: "LineMap",
+    trajectory: "np.ndarray",
+    drift: "np.ndarray",
+    files: list[Path],
 ) -> dict[str, Any]:
     """What `slam` says of its work."""
     import numpy as np
@@ -214,7 +242,7 @@ def _summary(
     from linemap_jax.lab.evaluation import explained_share
 
     seldom = -(-len(trajectory) // SCANS_EXPLAINED)
-    pieces = _at_poses(command, opened(command, command.log), trajectory, seldom)
+    pieces = _at_poses(command, opened(command, command.log), trajectory, drift, seldom)
     driven = np.hypot(*np.diff(trajectory[:, :2], axis=0).T).sum()
     return {
         "log": str(command.log),

@@ -300,6 +300,7 @@ class _Plan:
             range_max=float(range_max if options.range_max is None else options.range_max),
             pose=pose,
             cov_pose=cov,
+            time_increment=scan.time_increment,
             sweep_poses=sweep,
             pose_frame=options.pose_frame,
             odometry=None,

@@ -312,6 +312,7 @@ class _Parser:
             range_max=range_max if options.range_max is None else float(options.range_max),
             pose=pose,
             cov_pose=None,
+            time_increment=0.0,
             sweep_poses=None,
             pose_frame="laser" if options.poses is None else options.pose_frame,
             odometry=tail[3:6].copy(),

@@ -70,6 +70,7 @@ class Reading:
     range_max: float  # m; ranges from here on are no-returns
     pose: np.ndarray | None  # [3] x, y in m, theta in rad, in the world, at the time stamp; finite. None if not known
     cov_pose: np.ndarray | None  # [3, 3] of `pose`; positive definite. None if the log does not state it
+    time_increment: float  # s, from beam to beam; 0 if all were measured at once
     sweep_poses: np.ndarray | None  # [N, 3] poses when each beam was measured; None if that makes no difference
     pose_frame: Literal["laser", "robot"]  # whose pose it is
     odometry: np.ndarray | None  # [3] x, y in m, theta in rad: odometry's pose of the robot, if the log has it

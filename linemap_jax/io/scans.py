@@ -6,6 +6,7 @@ measured while the robot moved is brought to the pose at the scan's time stamp, 
 where the surface breaks.
 """
 
+import dataclasses
 from collections.abc import Iterable, Iterator
 from itertools import islice
 from typing import Any, NamedTuple
@@ -13,6 +14,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from linemap_jax.core.frames_on_host import between, compose
 from linemap_jax.core.state import Pose, Scan
 from linemap_jax.core.sweep import close_sweep
 from linemap_jax.io.reading import Reading
@@ -27,6 +29,7 @@ class Chunk(NamedTuple):
     poses: Pose  # [T]; NaN where the log has none
     timestamps: np.ndarray  # [T] s
     odometry: np.ndarray  # [T, 3] m, m, rad; odometry's poses of the robot, NaN where the log has none beside its poses
+    last_beam: np.ndarray  # [T, 3] m, m, rad; pose of the robot at the last beam, seen from that at the first
 
 
 def chunks_of_readings(
@@ -64,7 +67,29 @@ def chunks_of_readings(
             poses=Pose(mean=jnp.asarray(mean), cov=jnp.asarray(cov.astype(dtype))),
             timestamps=np.array([reading.timestamp for reading in batch]),
             odometry=np.stack([np.full(3, np.nan) if r.odometry is None else r.odometry for r in batch]),
+            last_beam=np.stack([_moved(reading) for reading in batch]),
         )
+
+
+def with_drift(readings: Iterable[Reading], rates: np.ndarray, every: int = 1) -> Iterator[Reading]:
+    """Readings whose sweeps moved as the poses say and, beside that, drifted.
+
+    Args:
+      readings: the log.
+      rates: of the robot in its own frame, for each scan that is taken; the others, and those of one instant, stay as
+        they are. m/s, m/s, rad/s. Shape `[T, 3]`.
+      every: every n-th reading is taken.
+
+    Yields:
+      The readings, in the order of the log.
+    """
+    for number, reading in enumerate(readings):
+        scan, left_out = divmod(number, every)
+        if reading.sweep_poses is not None and not left_out and scan < len(rates):
+            seconds = reading.time_increment * np.arange(len(reading.sweep_poses))
+            drifted = compose(reading.sweep_poses, seconds[:, None] * rates[scan])
+            reading = dataclasses.replace(reading, sweep_poses=drifted)
+        yield reading
 
 
 def _scans(batch: list[Reading], width: int, dtype: Any) -> Scan:
@@ -122,6 +147,11 @@ def at_first_beam(
     # A beam without a return has no point; its direction alone is turned.
     turned = np.where(ranges > 0, turned, theta - theta[0])
     return np.where(ranges > 0, np.hypot(dx, dy), 0), bearings + turned - 2 * np.pi * np.round(turned / (2 * np.pi))
+
+
+def _moved(reading: Reading) -> np.ndarray:
+    poses = reading.sweep_poses
+    return np.zeros(3) if poses is None else between(poses[0], poses[-1])
 
 
 def _filled(values: np.ndarray, width: int, value: float) -> np.ndarray:

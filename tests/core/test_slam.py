@@ -1,6 +1,7 @@
 """Surfaces, registration, loops, the pose graph and the adjustment: against NumPy, and in rooms that are known."""
 
 import dataclasses
+from functools import partial
 from typing import Any
 
 import jax
@@ -10,9 +11,12 @@ import pytest
 from maps import lines_between, poles_at
 
 from linemap_jax.core.estimation.adjustment import (
+    Adjusted,
     LineSightings,
     adjust,
     residual_of_sighting,
+    sightings_of_scan,
+    with_error_of_first,
     with_error_of_poses,
 )
 from linemap_jax.core.estimation.loops import LoopSettings, close_loop
@@ -21,7 +25,8 @@ from linemap_jax.core.estimation.pose_graph import Closures, PoseGraph, cov_of_r
 from linemap_jax.core.estimation.registration import nearest, register
 from linemap_jax.core.estimation.surface import Surface, middle_of, seen_from, surface_of_scan
 from linemap_jax.core.estimation.tracking import TrackingSettings, _cov_guess, begin_track, track
-from linemap_jax.core.state import LineMap, Lines, Scan, empty_lines
+from linemap_jax.core.settings import SensorNoise, Thresholds
+from linemap_jax.core.state import LineMap, Lines, Pose, Scan, empty_lines
 from linemap_jax.slam import slam
 
 adjusted, optimised = jax.jit(adjust), jax.jit(optimise)
@@ -387,6 +392,68 @@ def test_what_no_keyframe_has_seen_is_as_uncertain_as_the_nearest_one() -> None:
         jac = np.stack([(function(h) - function(-h)) / 2e-6 for h in 1e-6 * np.eye(3)], -1)
         np.testing.assert_allclose(cov[0] - before[0], jac @ cov_poses[0] @ jac.T, atol=1e-10)
         np.testing.assert_array_equal(cov[1:], before[1:])
+
+
+def test_where_the_first_pose_errs_all_turns_and_moves_with_it() -> None:
+    """As a rigid body; derivatives are numerical. Lines without a sighting stay."""
+    root = np.array([[0.03, 0.0, 0.0], [0.01, 0.02, 0.0], [-0.004, 0.006, 0.01]])
+    cov = root @ root.T
+    poses = np.array([[1.0, -2.0, 0.5], [4.0, 0.0, 2.0], [6.0, 3.0, -1.0]])
+    lines = lines_between([[[3.0, 4.0], [5.0, 4.5]], [[3.0, 0.0], [5.0, 0.0]]], room=3)
+    before = Adjusted(
+        jnp.asarray(poses),
+        jnp.asarray(np.tile(0.1 * np.eye(3), (3, 1, 1))),
+        lines,
+        jnp.asarray([True, False, False]),
+        1.0,
+    )
+    after = with_error_of_first(before, jnp.asarray(cov))
+    anchor, normal = np.asarray(lines.anchor)[0], np.asarray(lines.normal)[0]
+
+    def moved(error: np.ndarray, pose: np.ndarray) -> np.ndarray:
+        return compose(poses[0] + error, between(poses[0], pose))
+
+    def line(error: np.ndarray) -> np.ndarray:
+        place, ahead = (moved(error, [*point, 0.0])[:2] for point in (anchor, anchor + normal))
+        turned = ahead - place
+        return np.array([turned @ (place - anchor), np.arctan2(*turned[::-1])])
+
+    def derivative(function: Any) -> np.ndarray:
+        return np.stack([(function(h) - function(-h)) / 2e-6 for h in 1e-6 * np.eye(3)], -1)
+
+    for k, pose in enumerate(poses):
+        jac = derivative(lambda error, pose=pose: moved(error, pose))
+        np.testing.assert_allclose(after.cov_poses[k], 0.1 * np.eye(3) + jac @ cov @ jac.T, atol=1e-9)
+    jac = derivative(line)
+    own = lines.cov_independent
+    np.testing.assert_allclose(after.lines.cov_independent[0], own[0] + jac @ cov @ jac.T, atol=1e-9)
+    np.testing.assert_array_equal(after.lines.cov_independent[1:], own[1:])
+
+
+def test_what_was_seen_in_a_sweep_errs_with_it() -> None:
+    """A scanner that was elsewhere when it saw a line: derivatives by moving it, in its own frame."""
+    pose = np.array([1.0, -0.5, 0.4])
+    scan = Scan.from_ranges(jnp.asarray(ranges_in(ROOM, pose)), jnp.asarray(BEARINGS), range_max=30.0)
+    begin, end = ROOM, np.roll(ROOM, -1, 0)
+    lines = lines_between(np.stack([begin, end], 1).tolist(), room=8)
+    root = np.array([[0.03, 0.0, 0.0], [0.01, 0.02, 0.0], [-0.004, 0.006, 0.01]])
+    here = Pose(mean=jnp.asarray(pose), cov=jnp.diag(jnp.asarray([0.02, 0.02, 0.005]) ** 2))
+    see = jax.jit(partial(sightings_of_scan, thresholds=Thresholds(), noise=SensorNoise()))
+    still, moving = (see(scan, here, lines, 7, jnp.asarray(cov)) for cov in (np.zeros((3, 3)), root @ root.T))
+    assert still.valid.sum() >= 3
+    for i in np.flatnonzero(still.valid):
+        anchor, angle = np.asarray(still.anchor[i]), float(still.angle[i])
+        normal = np.array([np.cos(angle), np.sin(angle)])
+
+        def seen(error: np.ndarray, anchor: np.ndarray = anchor, normal: np.ndarray = normal) -> np.ndarray:
+            """The line, through its anchor, as seen from the place in error: (offset there, angle)."""
+            place, ahead = (between(error, [*point, 0.0])[:2] for point in (anchor, anchor + normal))
+            turned = ahead - place
+            return np.array([turned @ (place - anchor), np.arctan2(*turned[::-1])])
+
+        jac = np.stack([(seen(h) - seen(-h)) / 2e-6 for h in 1e-6 * np.eye(3)], -1)
+        added = np.asarray(moving.cov[i] - still.cov[i])
+        np.testing.assert_allclose(added, jac @ root @ root.T @ jac.T, atol=1e-9)
 
 
 def tracked(corners: list[np.ndarray], poses: np.ndarray, odometry: np.ndarray) -> list[Any]:

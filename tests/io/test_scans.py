@@ -5,9 +5,10 @@ import math
 import numpy as np
 import pytest
 
+from linemap_jax.core.frames_on_host import compose
 from linemap_jax.core.state import Scan
 from linemap_jax.io.reading import Reading
-from linemap_jax.io.scans import at_first_beam, chunks_of_readings
+from linemap_jax.io.scans import at_first_beam, chunks_of_readings, with_drift
 
 COV = np.diag([0.1, 0.2, 0.3])
 
@@ -21,6 +22,7 @@ def reading(ranges, bearings=None, **fields) -> Reading:
         "range_max": 10.0,
         "pose": np.array([1.0, 2.0, 3.0]),
         "cov_pose": None,
+        "time_increment": 0.0,
         "sweep_poses": None,
         "pose_frame": "robot",
         "odometry": None,
@@ -112,6 +114,29 @@ def test_what_is_seen_while_moving_is_brought_to_the_first_beam(mount):
     np.testing.assert_allclose(found[valid], np.array(still)[valid], atol=1e-9)
     assert np.abs(found - np.nan_to_num(ranges)).max() > 0.05  # as it was measured it is off by far more
     assert np.all(np.abs(at - bearings) < 0.2)
+
+
+def test_a_drift_beside_what_the_wheels_count():
+    """Wheels that miss some of the motion: with it, the beams come to where they were measured from."""
+    bearings = np.linspace(-0.9, 0.4, 181)
+    times = 0.1 * np.arange(181) / 180
+    still, rate = np.zeros(3), np.array([0.3, -0.1, 0.5])
+    poses = compose(np.array([0.0, 0.0, 0.03]), times[:, None] * rate)
+    ranges = np.array([wall(pose, still, bearing) for pose, bearing in zip(poses, bearings, strict=True)])
+    counted = np.tile(poses[0], (181, 1))
+    counted[:, 0] += 1e-9 * np.arange(181)  # else the reader would have said that it makes no difference
+    swept = reading(ranges, bearings, pose=poses[0], sweep_poses=counted, time_increment=0.1 / 180)
+    at_once = reading(ranges, bearings)
+    # Every second reading is taken, and of those only two have a drift.
+    readings = list(with_drift([swept, swept, swept, at_once, swept], np.array([rate, -rate]), every=2))
+    assert [r is swept for r in readings] == [False, True, False, False, True]
+    assert readings[3] is at_once
+    np.testing.assert_allclose(readings[0].sweep_poses, poses, atol=1e-6)
+    np.testing.assert_allclose(readings[2].sweep_poses, compose(poses[0], -times[:, None] * rate), atol=1e-6)
+    chunk = chunk_of(readings[0], at_once)
+    ahead = [wall(poses[0], still, bearing) for bearing in np.asarray(chunk.scans.bearings[0])]
+    np.testing.assert_allclose(chunk.scans.ranges[0], ahead, atol=1e-6)
+    np.testing.assert_allclose(chunk.last_beam, [0.1 * rate, [0, 0, 0]], atol=1e-6)
 
 
 def test_a_robot_that_stands_changes_nothing():

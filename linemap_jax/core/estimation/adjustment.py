@@ -71,6 +71,7 @@ def sightings_of_scan(
     pose: Pose,
     lines: Lines,
     keyframe: Int[Array, ""],
+    cov_sweep: Float[Array, "3 3"],
     *,
     thresholds: Thresholds,
     noise: SensorNoise,
@@ -84,6 +85,8 @@ def sightings_of_scan(
       pose: of the scanner, with what its neighbours tell of its error; the gates of matching widen by it.
       lines: of the map.
       keyframe: its number.
+      cov_sweep: what the scanner's pose in its own frame errs by from one line to another, since it moved while it
+        swept; zero for a scan of one instant. m^2, m rad, rad^2.
       thresholds: of extraction and matching.
       noise: of the scanner.
       capacity: slots for what one scan holds.
@@ -98,12 +101,19 @@ def sightings_of_scan(
     foot = found.lines.anchor + found.lines.offset[:, None] * found.lines.normal - pose.mean[None, :2]
     turn = jnp.where(reverse, jnp.pi, 0).astype(foot.dtype) - pose.mean[2]
     sign = jnp.where(reverse, -1, 1).astype(foot.dtype)
+    anchor, angle = rotate(-pose.mean[2], foot), wrap_angle(found.lines.angle + turn)
+
+    def from_sweep(anchor: Array, angle: Array) -> Array:
+        here = jnp.zeros(3, anchor.dtype)
+        by_pose = jax.jacfwd(residual_of_sighting)(here, jnp.stack([here[0], angle]), anchor, anchor, angle)
+        return propagate(by_pose, cov_sweep)
+
     return LineSightings(
         keyframe=jnp.broadcast_to(keyframe, slot.shape),
         line=slot,
-        anchor=rotate(-pose.mean[2], foot),
-        angle=wrap_angle(found.lines.angle + turn),
-        cov=with_sign(found.cov_measurement, sign),
+        anchor=anchor,
+        angle=angle,
+        cov=with_sign(found.cov_measurement, sign) + jax.vmap(from_sweep)(anchor, angle),
         valid=found.lines.valid & (nis < thresholds.match_nis),
     )
 
@@ -231,6 +241,36 @@ def adjust(graph: PoseGraph, lines: Lines, sightings: LineSightings) -> Adjusted
     return Adjusted(poses, symmetric(cov_poses), moved, seen, unit_variance)
 
 
+def with_error_of_first(adjusted: Adjusted, cov: Float[Array, "3 3"]) -> Adjusted:
+    """The same where the first pose, which is held, errs: all turns and moves with it.
+
+    Args:
+      adjusted: poses and lines, with the first pose held.
+      cov: of that pose, in the axes of the world: m^2, m rad, rad^2. Shape `[3, 3]`.
+
+    Returns:
+      The same estimates with larger covariances.
+    """
+    first = adjusted.poses[0, :2]
+
+    def of_pose(pose: Float[Array, "3"]) -> Array:
+        return propagate(jnp.eye(3, dtype=cov.dtype).at[:2, 2].set(perp(pose[:2] - first)), cov)
+
+    lines = adjusted.lines
+    of_lines = jax.vmap(_line_moved, (0, 0, None))(perp(lines.anchor - first[None]), lines.normal, cov)
+    of_lines = jnp.where(adjusted.seen[:, None, None], of_lines, 0)
+    return adjusted._replace(
+        cov_poses=adjusted.cov_poses + jax.vmap(of_pose)(adjusted.poses),
+        lines=dataclasses.replace(lines, cov_independent=lines.cov_independent + of_lines),
+    )
+
+
+def _line_moved(lever: Float[Array, "2"], normal: Float[Array, "2"], cov: Float[Array, "3 3"]) -> Float[Array, "2 2"]:
+    """Covariance of (offset, angle) of a line that moves with a pose, `lever` away and turned by +90 degrees."""
+    jac = jnp.zeros((2, 3), cov.dtype).at[0].set(jnp.append(normal, dot(normal, lever))).at[1, 2].set(1)
+    return propagate(jac, cov)
+
+
 def with_error_of_poses(
     line_map: LineMap, seen: Bool[Array, " K"], poses: Float[Array, "N 3"], cov_poses: Float[Array, "N 3 3"]
 ) -> LineMap:
@@ -255,8 +295,7 @@ def with_error_of_poses(
 
     def of_line(anchor: Array, normal: Array) -> Array:
         lever, cov = nearest_pose(anchor)
-        jac = jnp.zeros((2, 3), cov.dtype).at[0].set(jnp.append(normal, dot(normal, lever))).at[1, 2].set(1)
-        return propagate(jac, cov)
+        return _line_moved(lever, normal, cov)
 
     def of_circle(center: Array) -> Array:
         lever, cov = nearest_pose(center)
