@@ -1,6 +1,5 @@
 """Runs of consecutive points: which points belong to which, and sums over them."""
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
@@ -22,22 +21,12 @@ class Runs:
     """Slot of each point's run, -1 for none."""
 
     def sum(self, per_point: Float[Array, "N *s"]) -> Float[Array, "K *s"]:
-        """Sum of `per_point` over the points of each run, in one pass: each begins at the first point of its run.
-
-        Zero for free slots.
-        """
-        n = self.of_point.shape[0]
-        rows = jnp.where((self.of_point >= 0)[:, None], per_point.reshape(n, -1), 0)
-        begins = jnp.zeros(n, bool).at[self.first].set(True)
-
-        def add(total: Array, x: tuple[Array, Array]) -> tuple[Array, Array]:
-            row, begins = x
-            total = jnp.where(begins, 0, total) + row
-            return total, total
-
-        _, running = jax.lax.scan(add, jnp.zeros_like(rows[0]), (rows, begins))
-        total = jnp.where(self.valid[:, None], running[self.last], 0)
-        return total.reshape(self.valid.shape[0], *per_point.shape[1:])
+        """Sum of `per_point` over the points of each run, one after the other; zero for free slots."""
+        n, k = self.of_point.shape[0], self.valid.shape[0]
+        place = jnp.where(self.of_point < 0, k, self.of_point)
+        rows = per_point.reshape(n, -1)
+        total = jnp.zeros((k, rows.shape[1]), rows.dtype).at[place].add(rows, mode="drop")
+        return jnp.where(self.valid[:, None], total, 0).reshape(k, *per_point.shape[1:])
 
     def only(self, which: Bool[Array, " N"], size: int) -> tuple[Int[Array, " M"], "Runs"]:
         """Some of the points, moved together in `M = size` places, and the runs that they belong to.

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from linemap_jax.core.frames import rotate, unit, wrap_angle
-from linemap_jax.core.propagation import jacobian, propagate
+from linemap_jax.core.frames import perp, rotate, unit, wrap_angle
+from linemap_jax.core.propagation import propagate
 from linemap_jax.core.settings import Jacobians, Mount, SensorNoise
 from linemap_jax.core.slots import computed_once, rank_of_true
 from linemap_jax.core.state import Pose, Scan, pytree
@@ -79,12 +79,7 @@ def jac_point_pose(
     Returns:
       Without unit, and m in the last column. Shape `[2, 3]`.
     """
-    c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
-    cb, sb = jnp.cos(pose[2] + mount[2] + measurement[1]), jnp.sin(pose[2] + mount[2] + measurement[1])
-    one, zero = jnp.ones_like(c), jnp.zeros_like(c)
-    dx = -mount[0] * s - mount[1] * c - measurement[0] * sb
-    dy = mount[0] * c - mount[1] * s + measurement[0] * cb
-    return jnp.stack([jnp.stack([one, zero, dx]), jnp.stack([zero, one, dy])])
+    return _by_pose(point_from_measurement(pose, measurement, mount) - pose[:2])
 
 
 def jac_point_measurement(
@@ -100,9 +95,18 @@ def jac_point_measurement(
     Returns:
       Without unit, and m in the last column. Shape `[2, 2]`.
     """
-    angle = pose[2] + mount[2] + measurement[1]
-    c, s = jnp.cos(angle), jnp.sin(angle)
-    return jnp.stack([jnp.stack([c, -measurement[0] * s]), jnp.stack([s, measurement[0] * c])])
+    return _by_measurement(measurement[0], unit(pose[2] + mount[2] + measurement[1]))
+
+
+def _by_pose(position: Float[Array, "*s 2"]) -> Float[Array, "*s 2 3"]:
+    """d(point) / d(x, y, theta): a point moves with the robot and turns about it."""
+    identity = jnp.broadcast_to(jnp.eye(2, dtype=position.dtype), (*position.shape, 2))
+    return jnp.concatenate([identity, perp(position)[..., None]], -1)
+
+
+def _by_measurement(range_: Float[Array, "*s"], beam: Float[Array, "*s 2"]) -> Float[Array, "*s 2 2"]:
+    """d(point) / d(range, bearing): along the beam, and across it as far as the range is long."""
+    return jnp.stack([beam, range_[..., None] * perp(beam)], -1)
 
 
 def cov_measurement(noise: SensorNoise) -> Float[Array, "2 2"]:
@@ -155,26 +159,28 @@ def points_from_scan(scan: Scan, pose: Pose, mount: Mount, *, jacobians: Jacobia
         return range_, bearing, unit(here[2] + at[2] + bearing)
 
     range_, bearing, beam = computed_once(of_beam, order)
-    measurement = jnp.stack([range_, bearing], -1)
-
-    def by_pose(x: Array, s: Array) -> Array:
-        return jacobian(lambda p: point_from_measurement(p, s, at), lambda p: jac_point_pose(p, s, at), jacobians)(x)
-
-    def by_measurement(s: Array) -> Array:
-        return jacobian(
-            lambda m: point_from_measurement(here, m, at), lambda m: jac_point_measurement(here, m, at), jacobians
-        )(s)
-
+    laser = rotate(here[2], at[:2])
+    position = laser[None] + range_[:, None] * beam
+    if jacobians == "analytic":
+        # As `jac_point_pose` and `jac_point_measurement`, with the beams as they are known already.
+        jac_pose, jac_measurement = _by_pose(position), _by_measurement(range_, beam)
+    elif jacobians == "autodiff":
+        measurement = jnp.stack([range_, bearing], -1)
+        jac_pose, jac_measurement = jax.vmap(jax.jacfwd(point_from_measurement, (0, 1)), (None, 0, None))(
+            here, measurement, at
+        )
+    else:
+        raise ValueError(f"jacobians must be 'autodiff' or 'analytic', not {jacobians!r}")
     return Points(
-        position=jax.vmap(lambda s: point_from_measurement(here, s, at))(measurement),
+        position=position,
         beam=beam,
         range=range_,
         turn=jnp.abs(wrap_angle(bearing - jnp.concatenate([bearing[:1], bearing[:-1]]))),
         valid=valid,
         index=order,
-        jac_pose=jax.vmap(lambda s: by_pose(here, s))(measurement),
-        jac_measurement=jax.vmap(by_measurement)(measurement),
-        laser=rotate(here[2], at[:2]),
+        jac_pose=jac_pose,
+        jac_measurement=jac_measurement,
+        laser=laser,
         spacing=scan.spacing,
     )
 
