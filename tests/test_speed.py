@@ -77,13 +77,21 @@ def hot_loops(dtype: Any) -> dict[str, tuple[Callable[..., Any], Any]]:
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
-@pytest.mark.parametrize("name", ["segmentation", "clusters", "sums over runs", "ranks", "the last before each"])
+@pytest.mark.parametrize("name", ["segmentation", "clusters", "ranks", "the last before each"])
 def test_a_loop_over_the_beams_is_one_kernel(name: str, dtype: str) -> None:
     function, given = hot_loops(np.dtype(dtype))[name]
     text = jax.jit(function, compiler_options=AS_USERS).lower(given).compile().as_text()
     kernels, others = loops(text)
     assert kernels >= 1
     assert others == 0, "XLA runs this loop kernel by kernel, which takes thirty times as long: is its body too large?"
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_sums_over_runs_are_a_scatter_and_no_loop(dtype: str) -> None:
+    function, given = hot_loops(np.dtype(dtype))["sums over runs"]
+    text = jax.jit(function, compiler_options=AS_USERS).lower(given).compile().as_text()
+    assert " scatter(" in text
+    assert loops(text) == (0, 0)
 
 
 def test_a_loop_that_is_too_large_is_told_from_one_that_is_not() -> None:

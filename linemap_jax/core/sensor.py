@@ -145,6 +145,9 @@ def points_from_scan(scan: Scan, pose: Pose, mount: Mount, *, jacobians: Jacobia
 
     Returns:
       `N` points; those that are not valid stand last.
+
+    Raises:
+      ValueError: at trace time, for `jacobians` that do not exist.
     """
     # The position of the robot is left out: it adds nothing to the derivatives, and takes digits from the points.
     here = pose.mean.at[:2].set(0)
