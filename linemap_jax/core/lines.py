@@ -368,8 +368,7 @@ def _at_corners(
         exists = runs.valid & runs.valid[beside] & (beside != jnp.arange(count))
         there = runs.spread(jnp.concatenate([normal[beside], middle[beside]], -1))
         across = dot(there[:, :2], points.position - there[:, 2:])
-        along_beam = dot(there[:, :2], points.beam) ** 2
-        variance = noise.range_sigma**2 * along_beam + (points.range * noise.bearing_sigma) ** 2 * (1 - along_beam)
+        variance = _var_across(dot(there[:, :2], points.beam) ** 2, points.range, noise)
         own = (runs.of_point >= 0) & (across**2 > UNSURE_SIGMAS**2 * variance)
         # How many points of the run come beyond the outermost one that is surely its own
         if side > 0:
@@ -415,13 +414,16 @@ def _strange_ends(
         from_middle = points.position[at] - fit.origin - fit.centroid
         u, _ = _regressor_first(from_middle, fit.steep)
         rest = jnp.maximum(1 - 1 / fit.count - fit.count * u * u / jnp.where(fit.width > 0, fit.width, 1), 0)
-        along_beam = dot(normal, points.beam[at]) ** 2
-        across_beam = (points.range[at] * noise.bearing_sigma) ** 2
-        variance = across_beam + (noise.range_sigma**2 - across_beam) * along_beam
+        variance = _var_across(dot(normal, points.beam[at]) ** 2, points.range[at], noise)
         gate = jnp.maximum(thresholds.line_distance**2 * rest**2, thresholds.line_sigmas**2 * variance * rest)
         out = runs.valid & (dot(normal, from_middle) ** 2 > gate)
         strange = strange.at[jnp.where(out, at, strange.shape[0])].set(True, mode="drop")
     return strange
+
+
+def _var_across(cosine2: Float[Array, " M"], range_: Float[Array, " M"], noise: SensorNoise) -> Float[Array, " M"]:
+    """Variance of points across a line that their beams meet at an incidence of this squared cosine, m^2."""
+    return noise.range_sigma**2 * cosine2 + (range_ * noise.bearing_sigma) ** 2 * (1 - cosine2)
 
 
 def length_of_run(run: Run, position: Float[Array, "N 2"]) -> Float[Array, " N"]:
