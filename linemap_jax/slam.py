@@ -19,8 +19,10 @@ from scipy.sparse.csgraph import dijkstra
 
 from linemap_jax.build import STATIC, build
 from linemap_jax.core.estimation.adjustment import (
+    CircleSightings,
     LineSightings,
     adjust,
+    circles_from_sightings,
     sightings_of_scan,
     with_error_of_first,
     with_error_of_poses,
@@ -34,7 +36,7 @@ from linemap_jax.core.estimation.tracking import Track, Tracked, TrackingSetting
 from linemap_jax.core.fields import documented
 from linemap_jax.core.frames_on_host import between, compose
 from linemap_jax.core.settings import Method, SensorNoise, Thresholds
-from linemap_jax.core.state import LineMap, Lines, Pose, Scan, pad_stack
+from linemap_jax.core.state import LineMap, Pose, Scan, pad_stack
 
 CHUNK = 64
 """Scans in one jitted call."""
@@ -277,14 +279,14 @@ class Slam:
             size = len(scans.ranges)
             poses = _uncertain(self._poses[i : i + CHUNK], SIGMA_NEXT, dtype)
             piece = pad_stack((scans, poses, numbers[i : i + CHUNK], cov_sweeps[i : i + CHUNK]), CHUNK)
-            seen = _jit_sightings(*piece, line_map.lines, thresholds=thresholds, noise=noise, **method)
-            pieces.append(jax.tree.map(partial(_flat, size), seen))
-        valid = np.concatenate([piece.valid for piece in pieces])
-        seen = jax.tree.map(lambda *x: np.concatenate(x)[valid], *pieces)
+            found = _jit_sightings(*piece, line_map, thresholds=thresholds, noise=noise, **method)
+            pieces.append(jax.tree.map(partial(_flat, size), found))
+        found = jax.tree.map(lambda *x: np.concatenate(x), *pieces)
+        seen, circles_seen = (jax.tree.map(lambda x, kind=kind: x[kind.valid], kind) for kind in found)
         used = np.flatnonzero(np.asarray(line_map.lines.valid))
         place = np.zeros(line_map.lines.valid.shape[0], int)
         place[used] = np.arange(len(used))
-        m, k = _tight(valid.sum()), _tight(len(used))
+        m, k = _tight(len(seen.valid)), _tight(len(used))
         with jax.enable_x64(True):
             sightings = LineSightings(
                 keyframe=_filled(seen.keyframe, m, (), int),
@@ -306,9 +308,14 @@ class Slam:
             done.lines,
         )
         seen = _put(np.zeros(place.shape, bool), used, np.asarray(done.seen)[: len(used)])
-        moved = dataclasses.replace(line_map, lines=moved)
         with jax.enable_x64(True):
-            return _jit_error_of_poses(moved, seen, self._poses, covs), covs
+            m = _tight(len(circles_seen.valid))
+            of_circles = jax.tree.map(lambda x: _filled(x, m, x.shape[1:], _wide(x.dtype)), circles_seen)
+            of_circles = dataclasses.replace(of_circles, cov=_filled(circles_seen.cov, m, (3, 3), fill=np.eye(3)))
+            circles = jax.tree.map(lambda x: jnp.asarray(x, _wide(x.dtype)), line_map.circles)
+            circles = _jit_circles(circles, done.poses, done.cov_poses, of_circles)
+            circles = jax.tree.map(lambda new, old: new.astype(old.dtype), circles, line_map.circles)
+            return _jit_error_of_poses(LineMap(lines=moved, circles=circles), seen, self._poses, covs), covs
 
     def drift(self, stamps: Float[np.ndarray, " T"]) -> Float[np.ndarray, "T 3"]:
         """How fast odometry goes astray at each scan, by the trajectory so far: evenly from keyframe to keyframe.
@@ -488,6 +495,7 @@ _jit_optimise = jax.jit(optimise)
 _jit_adjust = jax.jit(adjust)
 _jit_cov_steps = jax.jit(jax.vmap(cov_step, (0, None)))
 _jit_cov = jax.jit(cov_of_registration)
+_jit_circles = jax.jit(circles_from_sightings)
 _jit_error_of_first = jax.jit(with_error_of_first)
 _jit_error_of_poses = jax.jit(with_error_of_poses)
 _jit_middles = jax.jit(jax.vmap(middle_of))
@@ -499,15 +507,15 @@ def _jit_sightings(
     poses: Pose,
     numbers: Array,
     cov_sweeps: Array,
-    lines: Lines,
+    line_map: LineMap,
     *,
     thresholds: Thresholds,
     noise: SensorNoise,
     **method: Unpack[Method],
-) -> LineSightings:
-    def of_scan(x: tuple[Scan, Pose, Array, Array]) -> LineSightings:
+) -> tuple[LineSightings, CircleSightings]:
+    def of_scan(x: tuple[Scan, Pose, Array, Array]) -> tuple[LineSightings, CircleSightings]:
         scan, pose, number, cov_sweep = x
-        return sightings_of_scan(scan, pose, lines, number, cov_sweep, thresholds=thresholds, noise=noise, **method)
+        return sightings_of_scan(scan, pose, line_map, number, cov_sweep, thresholds=thresholds, noise=noise, **method)
 
     return jax.lax.map(of_scan, (scans, poses, numbers, cov_sweeps.astype(scans.ranges.dtype)))
 

@@ -160,7 +160,7 @@ class Report:
 
 
 class Sweep(NamedTuple):
-    """The valid beams of a scan, in their order, with all that one needs to know about them."""
+    """The valid beams of a scan, counter-clockwise, with all that one needs to know about them."""
 
     beam: np.ndarray  # [n], index in the scan
     r: np.ndarray  # [n]
@@ -337,10 +337,14 @@ def sweep_of(
     noise: Any,
     mount: Any,
 ) -> Sweep:
-    """The points of a scan, Eqs. (2)-(3). The pose must be finite."""
+    """The points of a scan, Eqs. (2)-(3), counter-clockwise. The pose must be finite."""
     noise, mount = _numbers(noise), _numbers(mount)
     pose_mean, pose_cov = np.asarray(pose_mean, float), np.asarray(pose_cov, float)
     beam = np.flatnonzero(np.asarray(valid, bool))
+    neighbours = beam[1:][np.diff(beam) == 1]
+    steps = wrap(np.asarray(bearings, float)[neighbours] - np.asarray(bearings, float)[neighbours - 1])
+    if np.sum(steps < 0) > np.sum(steps > 0):
+        beam = beam[::-1]  # counter-clockwise, however the scanner turns
     r, bearing = np.asarray(ranges, float)[beam], np.asarray(bearings, float)[beam]
     theta = pose_mean[2]
     c, s = math.cos(theta), math.sin(theta)
@@ -1276,13 +1280,13 @@ NO_MATCH = Match(-1, -1, 0.0, 0)
 
 
 def match_line(
-    new: Lines, lines: Lines, slots: np.ndarray, *, thresholds: Any, pose_error: PoseError, ties: Margin
+    new: Lines, lines: Lines, slots: np.ndarray, *, thresholds: Any, rules: Any, pose_error: PoseError, ties: Margin
 ) -> Match:
     """The line of the map, of those in the given slots, that one new line (of length 1) is."""
     if not len(slots):
         return NO_MATCH
     g = gates(new, lines.take(slots), thresholds=thresholds, pose_error=pose_error)
-    best = closest(g, g.geometric, ties)
+    best = closest(g, g.geometric & ((g.sign > 0) | (not rules.tell_sides)), ties)
     if best is None:
         return NO_MATCH
     slot = int(slots[best])
@@ -1463,7 +1467,14 @@ def _add(lines: Lines, slot: int, pieces: Lines, *, share: float, thresholds: An
 
 
 def _merge(
-    lines: Lines, targets: np.ndarray, pairs: list[Gates], *, thresholds: Any, pose_error: PoseError, ties: Margin
+    lines: Lines,
+    targets: np.ndarray,
+    pairs: list[Gates],
+    *,
+    thresholds: Any,
+    rules: Any,
+    pose_error: PoseError,
+    ties: Margin,
 ) -> dict[int, int]:
     """Join lines of the map that this scan has shown to be one.
 
@@ -1472,6 +1483,7 @@ def _merge(
       targets: for each new line the slot of the line that it is part of, -1 for none. Shape `[n]`.
       pairs: the new lines against each other: what the scan has seen side by side is not joined.
       thresholds: the gates.
+      rules: whether lines have sides.
       pose_error: what is known of the persisting parts.
       ties: notes how clear the choices were.
 
@@ -1487,7 +1499,8 @@ def _merge(
         if not len(others):
             continue
         against = gates(lines.take(int(g)), lines.take(others), thresholds=thresholds, pose_error=pose_error)
-        best = closest(against, against.geometric & (against.gap < 0), ties)
+        faces = (against.sign > 0) | (not rules.tell_sides)
+        best = closest(against, against.geometric & (against.gap < 0) & faces, ties)
         if best is not None and against.statistical[best]:
             other = int(others[best])
             candidates.append((float(against.nis[best]), i, min(int(g), other), max(int(g), other)))
@@ -1516,7 +1529,7 @@ Cuts = dict[int, list[tuple[float, float]]]
 
 
 def beam_cuts(
-    lines: Lines, sweep: Sweep, found: Extraction, own: np.ndarray, targets: np.ndarray, *, thresholds: Any
+    lines: Lines, sweep: Sweep, found: Extraction, own: np.ndarray, targets: np.ndarray, *, thresholds: Any, rules: Any
 ) -> Cuts:
     """What the beams of a scan have passed through, in place of the wipe triangle of s6.2.
 
@@ -1527,6 +1540,7 @@ def beam_cuts(
       own: for each new line the slot of the line that it was taken for, -1 for none. Shape `[n]`.
       targets: for each new line the slot of the line that it is part of, -1 for none. Shape `[n]`.
       thresholds: the margins.
+      rules: whether lines have sides.
 
     Returns:
       The cuts.
@@ -1560,6 +1574,7 @@ def beam_cuts(
     # A beam that ended on an extracted line reaches a little behind that line, to what was seen no more often.
     times = np.where(targets >= 0, lines.times_detected[targets], 0)
     dares = np.append(times, 0)[label[i]] >= old.times_detected[j]
+    dares &= (den > 0) | (not rules.tell_sides)
     height = np.abs(dot(found.lines.normal, apex - found.lines.anchor) - found.lines.offset)
     stretch = np.where(height < EDGE_ON, 0.0, 1 + t.wipe_extension / np.maximum(height, EDGE_ON))
     reach = np.maximum(sweep.r[i] - margin, np.where(dares, sweep.r[i] * np.append(stretch, 0.0)[label[i]], 0.0))
@@ -1918,14 +1933,14 @@ def update(
     )
 
     if rules.merge:
-        freed = _merge(lines, targets, pairs, thresholds=thresholds, pose_error=pose_error, ties=ties)
+        freed = _merge(lines, targets, pairs, thresholds=thresholds, rules=rules, pose_error=pose_error, ties=ties)
         report.merged += len(freed)
         for slots in (targets, suspects, report.line_slot):
             slots[:] = [freed.get(slot, slot) for slot in slots.tolist()]
 
     if rules.wipe_by_beams:
         own = np.where(targets >= 0, targets, suspects)
-        cuts = beam_cuts(lines, sweep, found, own, targets, thresholds=thresholds)
+        cuts = beam_cuts(lines, sweep, found, own, targets, thresholds=thresholds, rules=rules)
         _cut(lines, cuts, sweep, report, thresholds=thresholds, rules=rules)
     elif mode == "simultaneous":
         cuts = {}
@@ -1976,7 +1991,7 @@ def _lines_at_once(
     """
     n, view = len(found.lines.offset), Viewpoint(sweep.p, sweep.cov_pose)
     new, slots = forget(found.lines, share), np.flatnonzero(lines.valid)
-    matching = {"thresholds": thresholds, "pose_error": pose_error, "ties": ties}
+    matching = {"thresholds": thresholds, "rules": rules, "pose_error": pose_error, "ties": ties}
     matches = [match_line(new.take(i), lines, slots, **matching) for i in range(n)]
     if rules.share_pose:
         matches = part(matches, pairs)
@@ -2043,7 +2058,7 @@ def _lines_one_by_one(
         beside = {int(k) for k, c in zip(targets, pairs[i].collinear, strict=True) if not c and rules.share_pose}
         slots = [k for k in np.flatnonzero(lines.valid).tolist() if k not in beside]
         of_map, of_scan = (np.array([k for k in slots if (k in added) == fresh], int) for fresh in (False, True))
-        matching = {"thresholds": thresholds, "ties": ties}
+        matching = {"thresholds": thresholds, "rules": rules, "ties": ties}
         match = match_line(new.take(i), lines, of_map, pose_error=pose_error, **matching)
         other = match_line(new.take(i), lines, of_scan, pose_error=known, **matching)
         if other.dof and (not match.dof or other.nis < match.nis):

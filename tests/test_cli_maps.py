@@ -132,7 +132,7 @@ def test_other_settings_are_told() -> None:
     assert differences(now, now) == ""
     assert differences({"merged": []}, now) == ""
     assert differences(before | {"rules": PAPER_RULES}, now).endswith(
-        "rules.maximum_likelihood False (now True) and 10 more"
+        "rules.maximum_likelihood False (now True) and 11 more"
     )
 
 

@@ -312,7 +312,9 @@ def merge_lines(
     k = model.valid.shape[0]
     everywhere = jnp.arange(k, dtype=jnp.int32)
     others = (slots >= 0)[:, None] & (everywhere[None] != slots[:, None]) & ~seen_apart
-    partner, nis = matching.best_line(touched, model, thresholds, pose_error, among=others, overlapping=True)
+    partner, nis = matching.best_line(
+        touched, model, thresholds, pose_error, among=others, overlapping=True, same_side=rules.tell_sides
+    )
     some = nis < thresholds.match_nis
 
     pair = jnp.stack([slots, partner], -1)
@@ -363,13 +365,13 @@ def _sweep(
         line_of_point = jnp.where(points.valid, found.line_of_beam[points.index], -1)
         times = jnp.where(lines.targets >= 0, lines.model.times_detected[lines.targets], 0)
         swath = wiping.swath_of_scan(points, pose, line_of_point, found.lines, lines.own, times, thresholds)
-        affected = jax.vmap(lambda line, slot: wiping.may_have_passed(line, slot, swath, thresholds))(
+        affected = jax.vmap(lambda line, slot: wiping.may_have_passed(line, slot, swath, thresholds, rules))(
             directed(lines.model), slots
         )
         model, wiped = wiping.wipe_lines(
             lines.model,
             affected,
-            lambda line, slot: wiping.passed_through(line, slot, swath, pose.cov, thresholds, noise),
+            lambda line, slot: wiping.passed_through(line, slot, swath, pose.cov, thresholds, noise, rules),
             var_cut,
             thresholds,
             share_information=rules.merge,

@@ -119,6 +119,7 @@ def best_line(
     *,
     among: Bool[Array, "L K"] | None = None,
     overlapping: bool = False,
+    same_side: bool = False,
 ) -> tuple[Int[Array, " L"], Float[Array, " L"]]:
     """For each new line its best geometric match.
 
@@ -132,6 +133,7 @@ def best_line(
       pose_error: its model.
       among: the pairs that are considered; all unless given.
       overlapping: whether the segments must overlap.
+      same_side: whether they must have been seen from the same side.
 
     Returns:
       The slot in the map, and the normalised distance of Eq. (21), before the gate of Eq. (22); infinity where there is
@@ -141,6 +143,7 @@ def best_line(
     def score(a: Lines, b: Lines) -> Float[Array, ""]:
         pair: LineComparison = compare_lines(a, b, thresholds, pose_error)
         counts = pair.geometric & (pair.gap < 0) if overlapping else pair.geometric
+        counts = counts & (pair.sign > 0) if same_side else counts
         return jnp.where(counts, pair.nis + OVERLAP_WEIGHT * pair.gap, jnp.inf)
 
     by_model = jax.vmap(score, (None, 0))
@@ -213,13 +216,13 @@ def match_lines(
       model: the lines of the map.
       collinear: which lines of the scan may be pieces of one line.
       thresholds: `match_...`.
-      rules: `share_pose`, `leave_out_ambiguous`.
+      rules: `share_pose`, `tell_sides`, `leave_out_ambiguous`.
       pose_error: its model.
 
     Returns:
       For each new line its line of the map, or which one stands in its way.
     """
-    slot, nis = best_line(new, model, thresholds, pose_error)
+    slot, nis = best_line(new, model, thresholds, pose_error, same_side=rules.tell_sides)
     compared = jnp.isfinite(nis)
     matched = nis < thresholds.match_nis
     if rules.share_pose:

@@ -189,9 +189,15 @@ def points_from_scan(scan: Scan, pose: Pose, mount: Mount, *, jacobians: Jacobia
 
 
 def _in_order(scan: Scan) -> Int[Array, " N"]:
-    """The beams that returned, from the first one of the sweep on; `N` where there are no more."""
+    """The beams that returned, from the first one of the sweep on, counter-clockwise; `N` where there are no more.
+
+    So a line begins at its right end, as the scanner sees it, and its normal points away from there.
+    """
     n = scan.valid.shape[0]
+    both = scan.valid[1:] & scan.valid[:-1]
+    falling = jnp.sum(jnp.where(both, jnp.sign(wrap_angle(jnp.diff(scan.bearings))), 0)) < 0
     rank, count = rank_of_true(scan.valid), jnp.sum(scan.valid, dtype=jnp.int32)
     rank = rank - rank[scan.first]
-    place = jnp.where(scan.valid, jnp.where(rank < 0, rank + count, rank), n)
+    rank = jnp.where(rank < 0, rank + count, rank)
+    place = jnp.where(scan.valid, jnp.where(falling, count - 1 - rank, rank), n)
     return jnp.full(n, n, jnp.int32).at[place].set(jnp.arange(n, dtype=jnp.int32), mode="drop")

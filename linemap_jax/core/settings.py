@@ -179,6 +179,9 @@ class Rules:
     share_pose: bool = True
     """Pieces of one line in one scan share its pose error: it is counted once, and it does not make one of two lines
     that the scan has seen side by side."""
+    tell_sides: bool = True
+    """A line matches only what was seen from the same side, and a wall does not wipe its own back. A partition is
+    thinner than many a pose is known, and nothing else tells its two faces apart."""
     leave_out_ambiguous: bool = True
     """A new line that passes the geometric gates but fails the statistical one is neither fused nor added. To add
     it, as the paper does, holds the same wall twice: the gate turns true matches away too."""

@@ -19,7 +19,7 @@ from linemap_jax.core.frames import dot, perp, reanchor
 from linemap_jax.core.matching import normal_variance
 from linemap_jax.core.propagation import quadratic
 from linemap_jax.core.sensor import Points
-from linemap_jax.core.settings import Number, SensorNoise, Thresholds
+from linemap_jax.core.settings import Number, Rules, SensorNoise, Thresholds
 from linemap_jax.core.slots import all_true, first_true, put, rank_of_true, take
 from linemap_jax.core.state import Circles, Lines, Pose, pytree
 
@@ -128,6 +128,7 @@ def passed_through(
     cov_pose: Float[Array, "3 3"],
     thresholds: Thresholds,
     noise: SensorNoise,
+    rules: Rules,
 ) -> Stretches:
     """The stretches of a line of the map between neighbouring beams that both passed through it.
 
@@ -143,6 +144,7 @@ def passed_through(
       cov_pose: covariance of the pose.
       thresholds: `wipe_...`, `match_distance`.
       noise: of the sensor.
+      rules: `tell_sides`.
 
     Returns:
       Begin and end of each stretch, m from the anchor, and whether it is gone. Shapes `[N - 1]`.
@@ -166,6 +168,7 @@ def passed_through(
     margin = jnp.maximum(thresholds.wipe_sigmas**2 * spread, thresholds.match_distance**2)
     passed = (beyond > 0) & (beyond**2 > margin)
     behind = (distance < swath.reach) & (swath.times >= line.times_detected)
+    behind = behind & (incidence > 0) if rules.tell_sides else behind
 
     on_line = (along > line.extent[0]) & (along < line.extent[1])
     meets = meets & (distance > 0) & on_line & points.valid & line.valid
@@ -174,7 +177,9 @@ def passed_through(
     return jnp.minimum(along[:-1], along[1:]), jnp.maximum(along[:-1], along[1:]), gone
 
 
-def may_have_passed(line: Lines, slot: Int[Array, ""], swath: Swath, thresholds: Thresholds) -> Bool[Array, ""]:
+def may_have_passed(
+    line: Lines, slot: Int[Array, ""], swath: Swath, thresholds: Thresholds, rules: Rules
+) -> Bool[Array, ""]:
     """Whether `passed_through` can find anything: false for nearly all lines of a map, and cheap to tell.
 
     Two beams must pass a line by `match_distance`, or reach behind it; no spread is computed, and nothing divided.
@@ -184,6 +189,7 @@ def may_have_passed(line: Lines, slot: Int[Array, ""], swath: Swath, thresholds:
       slot: where it stands in the map.
       swath: the beams.
       thresholds: `match_distance`.
+      rules: `tell_sides`.
 
     Returns:
       Whether it is worth while to look.
@@ -194,11 +200,13 @@ def may_have_passed(line: Lines, slot: Int[Array, ""], swath: Swath, thresholds:
     incidence = dot(points.beam, normal[None])
     # Everything below is multiplied by the absolute value of the incidence.
     to_line = jnp.sign(incidence) * (line.offset - dot(normal, start))
+    from_its_side = incidence > 0
     incidence = jnp.abs(incidence)
     along = dot(tangent, start) * incidence + to_line * dot(points.beam, tangent[None])
     on_line = (along > line.extent[0] * incidence) & (along < line.extent[1] * incidence)
     passed = to_line + thresholds.match_distance < points.range * incidence
     behind = (to_line < swath.reach * incidence) & (swath.times >= line.times_detected)
+    behind = behind & from_its_side if rules.tell_sides else behind
     passes = (to_line > 0) & on_line & (passed | behind) & (swath.own != slot) & points.valid
     return line.valid & (jnp.sum(passes) >= 2)
 

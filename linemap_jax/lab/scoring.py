@@ -18,7 +18,7 @@ from linemap_jax.core.state import Circles, Extraction, LineMap, Lines, Scan, py
 from linemap_jax.lab.consistency import line_error, nees, walls_of
 from linemap_jax.lab.raycast import NOTHING, cast
 from linemap_jax.lab.scanners import Truth
-from linemap_jax.lab.world import NEVER, Time, World, there
+from linemap_jax.lab.world import NEVER, Kind, Time, World, there
 
 CELLS = 128
 """Cells of a straight piece, unless told otherwise: 10 cm each up to 12.8 m."""
@@ -39,7 +39,8 @@ class Gates:
     angle: Number = 0.087
     """Largest difference of direction of a line and a wall, rad (5 degrees)."""
     overlap: Number = 0.3
-    """A wall is held twice if this much of it is, m, or half of it where that is less."""
+    """A wall is held twice if this much of it is, m, or half of it where that is less. What is free on both sides (a
+    chain, `Kind.WALL`) has two faces, and may have a line on each."""
     cell: Number = 0.1
     """Walls and lines are divided into equal cells no longer than this, m, as long as the number of cells suffices.
     Lengths are sums of cells, each judged by its middle."""
@@ -245,7 +246,7 @@ class Score:
     wall_held: Float[Array, " S"]
     """How much of that has a line on it, m."""
     wall_twice: Float[Array, " S"]
-    """How much of each wall has two lines or more beside it, m."""
+    """How much of each wall has two lines or more beside it, of one face, m."""
     wall_pieces: Int[Array, " S"]
     """Pieces in which it is held: one more for each gap that was seen right across."""
     held_twice: Bool[Array, " S"]
@@ -356,7 +357,7 @@ def evaluate(
     fitted = (pole_of_circle >= 0) & circles.fitted
     cov = jnp.where(fitted[:, None, None], circles.cov, jnp.eye(3, dtype=circles.radius.dtype)[None])
 
-    twice = _length(by_lines.cells, by_lines.number >= 2) * is_there
+    twice = _length(by_lines.cells, jnp.any(by_lines.number >= 2, 0)) * is_there
     looked = by_lines.cells.valid & (seen.cells >= gates.scans) & is_there[:, None]
     return Score(
         line_length=jnp.sum(pieces.length * lines.valid),
@@ -414,7 +415,7 @@ class Matches(NamedTuple):
     false: Int[Array, ""]
     """Lines matched with one that does not."""
     missed: Int[Array, ""]
-    """Lines not matched, although the map holds their stretch of the wall."""
+    """Lines not matched, although the map holds their stretch of that face of the wall."""
 
 
 @jax.jit
@@ -462,7 +463,8 @@ def judge_matches(
     held = jnp.moveaxis(_stretches(walls, _lines(lines), gates).near, 1, 0)[wall]
     common = jnp.minimum(mine[:, None, 1], held[..., 1]) - jnp.maximum(mine[:, None, 0], held[..., 0])
     enough = jnp.minimum(jnp.asarray(gates.overlap, common.dtype), (mine[:, 1] - mine[:, 0]) / 2)
-    there_before = jnp.any((common >= enough[:, None]) & (wall_of_slot[None] == wall[:, None]), -1)
+    one_face = (dot(found.lines.tangent[:, None], lines.tangent[None]) > 0) | ~_has_two_faces(world)[wall][:, None]
+    there_before = jnp.any((common >= enough[:, None]) & (wall_of_slot[None] == wall[:, None]) & one_face, -1)
     missed = (wall >= 0) & (line_slot < 0) & there_before & (mine[:, 1] > mine[:, 0])
     return Matches(*(jnp.sum(x, dtype=jnp.int32) for x in (right, matched & ~right, missed)))
 
@@ -546,7 +548,7 @@ class _Cover(NamedTuple):
     """What lies along cells."""
 
     near: Array  # [A, P] whether some piece is near
-    number: Array  # [A, P] of pieces that lie beside it
+    number: Array  # [2, A, P] of pieces that lie beside it, on the first and on the second face
     linked: Array  # [A, P] whether one of them lies beside the next cell too
     cells: _Cells
 
@@ -643,31 +645,40 @@ def _both(a: Float[Array, "2"], b: Float[Array, "2"]) -> Float[Array, "2"]:
 _Carry = tuple[Array, Array, Array]
 
 
-def _cover(cells: _Cells, stretches: _Stretches) -> _Cover:
-    """What lies along each cell.
+def _cover(cells: _Cells, stretches: _Stretches, on_second: Bool[Array, "B A"] | None = None) -> _Cover:
+    """What lies along each cell, and on which face.
 
     One piece after the other, as rays are cast, so that the memory is that of the cells.
     """
     here = cells.middle
     following = jnp.concatenate([here[:, 1:], jnp.full_like(here[:, :1], jnp.inf)], 1)
 
-    def step(carry: _Carry, stretch: tuple[Array, Array]) -> tuple[_Carry, None]:
+    def step(carry: _Carry, stretch: tuple[Array, Array, Array]) -> tuple[_Carry, None]:
         near, number, linked = carry
-        (near_from, near_to), (beside_from, beside_to) = (jnp.moveaxis(s, -1, 0)[..., None] for s in stretch)
+        (near_from, near_to), (beside_from, beside_to) = (jnp.moveaxis(s, -1, 0)[..., None] for s in stretch[:2])
+        second = stretch[2][:, None]
         beside = (beside_from <= here) & (here <= beside_to)
         near |= (near_from <= here) & (here <= near_to)
-        return (near, number + beside, linked | (beside & (following <= beside_to))), None
+        number += jnp.stack([beside & ~second, beside & second])
+        return (near, number, linked | (beside & (following <= beside_to))), None
 
     nothing = jnp.zeros(here.shape, bool)
-    start = (nothing, nothing.astype(jnp.int32), nothing)
-    (near, number, linked), _ = jax.lax.scan(step, start, (stretches.near, stretches.beside))
+    start = (nothing, jnp.zeros((2, *here.shape), jnp.int32), nothing)
+    on_second = jnp.zeros(stretches.aside.shape, bool) if on_second is None else on_second
+    (near, number, linked), _ = jax.lax.scan(step, start, (stretches.near, stretches.beside, on_second))
     return _Cover(near=near, number=number, linked=linked, cells=cells)
 
 
 def _against_walls(lines: Lines, world: World, seen: Seen, gates: Gates) -> _Cover:
     """What of a map lies along the walls, there or not."""
     walls = _walls(world)
-    return _cover(_divide(walls, gates.cell, seen.cells.shape[1]), _stretches(walls, _lines(lines), gates))
+    on_second = (dot(lines.tangent[:, None], walls.tangent[None]) < 0) & _has_two_faces(world)[None]
+    return _cover(_divide(walls, gates.cell, seen.cells.shape[1]), _stretches(walls, _lines(lines), gates), on_second)
+
+
+def _has_two_faces(world: World) -> Bool[Array, " S"]:
+    """Whether a segment may be seen from both sides."""
+    return world.segments.kind == Kind.WALL
 
 
 def _pieces(cover: _Cover, looked: Bool[Array, "S P"]) -> Int[Array, " S"]:
@@ -676,7 +687,7 @@ def _pieces(cover: _Cover, looked: Bool[Array, "S P"]) -> Int[Array, " S"]:
     A piece begins at a cell with a line that is not linked with the cell before, if all cells between it and the last
     one with a line have been seen; the first one begins in any case.
     """
-    some = (cover.number > 0) & cover.cells.valid
+    some = jnp.any(cover.number > 0, 0) & cover.cells.valid
     unseen = jnp.cumsum(~looked, -1, dtype=jnp.int32)
     before = jax.lax.cummax(jnp.where(some, unseen, -1), axis=1)  # of the last cell with a line
 
@@ -697,7 +708,7 @@ def _held(
     others = _stretches(walls, walls._replace(valid=is_there), gates)
     open_to = cells.valid & (is_there[:, None] | ~_cover(cells, others).near)
     looked = open_to & (seen.cells >= gates.scans)
-    lengths = (_length(cells, which) for which in (looked & (by_lines.number > 0), looked))
+    lengths = (_length(cells, which) for which in (looked & jnp.any(by_lines.number > 0, 0), looked))
 
     poles_there = there(world.poles, scan_index)
     taken = jnp.any(near & poles_there[None], 1)

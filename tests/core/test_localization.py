@@ -227,7 +227,7 @@ def test_sightings_are_what_pose_and_map_err_by() -> None:
             cov_independent=jnp.broadcast_to(of_center, ROOM.circles.cov_independent.shape),
         )
         return (
-            sight_lines(seen, pose, cov, lines, Thresholds(), Rules(), settings),
+            sight_lines(seen, pose, cov, lines, Thresholds(), Rules(tell_sides=False), settings),
             sight_circles(seen, pose, cov, poles, 8, settings),
             sight_points(seen, pose, seen.alone, lines, noise, settings),
         )

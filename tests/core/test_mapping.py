@@ -72,6 +72,32 @@ def test_two_walls_seen_side_by_side_stay_two(pose_error: PoseError, persists: b
     np.testing.assert_allclose(abs(distance), STEP, atol=0.015)
 
 
+def test_both_faces_of_a_partition_are_held_whatever_the_sweep() -> None:
+    """A wall 4 cm thick that the robot sees from both sides, by turns, with a scanner of either direction."""
+    random = np.random.default_rng(4)
+    scans, poses = [], []
+    for k in range(12):
+        front, y = k % 2 == 0, random.uniform(-1, 1)
+        pose = np.array([0.0, y, 0.0] if front else [4.0, y, np.pi])
+        ranges = 1.98 / np.cos(BEARINGS) + float(NOISE.range_sigma) * random.standard_normal(len(BEARINGS))
+        order = slice(None, None, -1 if k % 4 > 1 else 1)
+        scans.append(Scan.from_ranges(ranges[order], BEARINGS[order]))
+        poses.append(pose)
+    at = Pose(mean=jnp.asarray(np.array(poses)), cov=jnp.asarray(np.tile(COV_POSE, (12, 1, 1))))
+    line_map = empty_map(Capacity(16, 8))
+    for k in range(12):
+        here = jax.tree.map(lambda x, k=k: x[k], at)
+        line_map, report = ONE(line_map, scans[k], here)
+        assert int(report.fused) == (k > 1)
+    lines = jax.tree.map(lambda x: np.asarray(x)[np.asarray(line_map.lines.valid)], line_map.lines)
+    assert lines.times_detected.tolist() == [6, 6]
+    np.testing.assert_allclose(lines.normal[:, 0], [1, -1], atol=0.01)
+    np.testing.assert_allclose(lines.anchor[:, 0] + lines.offset * lines.normal[:, 0], [1.98, 2.02], atol=0.005)
+
+
+ONE = jax.jit(partial(update, noise=NOISE, capacity=Capacity(8, 8)))
+
+
 def overlapping() -> LineMap:
     """The two walls, each held to reach a metre past where the other one begins, with the pose error of a scan."""
     empty = empty_map(Capacity(16, 8))

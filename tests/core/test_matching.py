@@ -17,7 +17,7 @@ FIXED = Thresholds(match_sigmas=0.0)
 WALL = [[0.0, 0.0], [4.0, 0.0]]
 ROOM = 3
 
-BEST = jax.jit(best_line, static_argnames=("pose_error", "overlapping"))
+BEST = jax.jit(best_line, static_argnames=("pose_error", "overlapping", "same_side"))
 MATCH = jax.jit(match_lines, static_argnames=("rules", "pose_error"))
 MATCH_CIRCLES = jax.jit(match_circles, static_argnames=("rules", "pose_error"))
 
@@ -90,6 +90,19 @@ def test_the_first_two_gates_widen_with_the_predicted_spread(sigmas: float) -> N
         ([[1, 0.086], [3, 0.086]], (0.02, 1e-4), False),
     ):
         assert compared(ends, sigma, thresholds).collinear == (wide and sigmas > 0)
+
+
+def test_what_is_seen_from_the_other_side_is_another_face() -> None:
+    """The nearer line of the map is the back of a partition: without sides it is the match."""
+    model, new = walls([[4.0, 0.0], [0.0, 0.0]], [[0.0, 0.03], [4.0, 0.03]]), walls([[1.0, 0.01], [3.0, 0.01]])
+    for same_side, slot in ((True, 1), (False, 0)):
+        assert int(BEST(new, model, FIXED, "independent", same_side=same_side)[0][0]) == slot
+    own = jnp.eye(ROOM, dtype=bool)
+    for rules, slot in ((Rules(), 1), (Rules(tell_sides=False), 0)):
+        assert int(MATCH(new, model, own, Thresholds(), rules, "independent").slot[0]) == slot
+    only_back = walls([[4.0, 0.0], [0.0, 0.0]])
+    match = MATCH(new, only_back, own, Thresholds(), Rules(), "independent")
+    assert (int(match.slot[0]), int(match.suspect[0])) == (-1, -1)
 
 
 def test_a_free_slot_matches_nothing() -> None:

@@ -10,6 +10,7 @@ import pytest
 from maps import lines_between, poles_at
 
 from linemap_jax.core.merging import merge_maps
+from linemap_jax.core.settings import Rules
 from linemap_jax.core.state import LineMap
 
 NO_POLE: list[Any] = []
@@ -49,7 +50,7 @@ def test_nothing_changes_a_map_nor_is_changed() -> None:
 def test_two_views_of_one_wall_become_one() -> None:
     """Seen 2 cm apart, the second one in the other direction: they are averaged, and the wall is as long as both."""
     a, b = map_of([[(0, 0), (4, 0)]], times=30), map_of([[(7, 0.02), (3, 0.02)]], times=10)
-    merged, report = merge_maps(a, b, pose_error="independent")
+    merged, report = merge_maps(a, b, rules=Rules(tell_sides=False), pose_error="independent")
     ((begin, end),) = walls(merged)
     np.testing.assert_allclose([begin[0], end[0]], [0, 7], atol=1e-4)
     assert int(report.lines_joined) == 1
@@ -59,6 +60,14 @@ def test_two_views_of_one_wall_become_one() -> None:
     shift = np.array([[1.0, 3.0], [0.0, 1.0]])
     information = np.linalg.inv(cov) + np.linalg.inv(shift @ cov @ shift.T)
     np.testing.assert_allclose(merged.lines.cov[0], np.linalg.inv(information), rtol=1e-6)
+
+
+def test_two_faces_of_one_partition_stay_two() -> None:
+    """What was seen from both sides, as near as it may be; the second map's other line continues the first."""
+    a, b = map_of([[(0, 0), (4, 0)]]), map_of([[(4, 0.02), (0, 0.02)], [(3, 0.01), (7, 0.01)]])
+    merged, report = merge_maps(a, b)
+    np.testing.assert_allclose(walls(merged)[:, :, 0], [[0, 7], [4, 0]], atol=1e-4)
+    assert int(report.lines_joined) == 1
 
 
 def test_covariances_hold_whatever_the_two_have_in_common() -> None:

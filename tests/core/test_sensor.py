@@ -116,6 +116,37 @@ def test_returns_stand_first_and_in_order() -> None:
     np.testing.assert_array_equal(points.per_beam(jnp.arange(6) + 10), [-1, 10, -1, 11, -1, 12])
 
 
+@pytest.mark.parametrize("first", [0, 17, 61])
+def test_points_run_counter_clockwise_whatever_the_sweep(first: int) -> None:
+    """A scanner that turns the other way, or begins anywhere: the same points in the same order."""
+    scan = room()
+    there = points_from_scan(scan, ORIGIN, Mount(), jacobians="analytic")
+    back = Scan.from_ranges(scan.ranges[::-1], scan.bearings[::-1], range_max=10.0)
+    seen = points_from_scan(back, ORIGIN, Mount(), jacobians="analytic")
+    count = int(there.valid.sum())
+    assert_same(seen.position[:count], there.position[:count])
+    assert_same(seen.index[:count], 60 - there.index[:count])
+    # A scanner all around, whose driver begins elsewhere.
+    bearings = np.radians(np.roll(np.arange(0, 360, 6), -first))
+    around = Scan.from_ranges(np.full(60, 3.0) + np.arange(60) / 100, bearings)
+    points = [
+        points_from_scan(s, ORIGIN, Mount(), jacobians="analytic").position[:60]
+        for s in (around, Scan.from_ranges(around.ranges[::-1], bearings[::-1]))
+    ]
+    turns = [np.diff(np.unwrap(np.arctan2(p[:, 1], p[:, 0]))) for p in points]
+    assert all((turn > 0).all() for turn in turns)
+
+
+def test_the_normal_of_a_line_points_away_from_who_sees_it() -> None:
+    for turned in (slice(None), slice(None, None, -1)):
+        scan = room()
+        scan = Scan.from_ranges(scan.ranges[turned], scan.bearings[turned], range_max=10.0)
+        lines = extract(scan, ORIGIN, capacity=CAPACITY).lines
+        away = jnp.sum(lines.anchor * lines.normal, -1) + lines.offset
+        assert int(lines.valid.sum()) >= 2
+        assert bool(jnp.all(away[lines.valid] > 0))
+
+
 def test_masked_beams_may_hold_anything() -> None:
     scan = room()
     before = extract(scan, ORIGIN, capacity=CAPACITY)

@@ -12,8 +12,10 @@ from maps import lines_between, poles_at
 
 from linemap_jax.core.estimation.adjustment import (
     Adjusted,
+    CircleSightings,
     LineSightings,
     adjust,
+    circles_from_sightings,
     residual_of_sighting,
     sightings_of_scan,
     with_error_of_first,
@@ -101,6 +103,31 @@ def test_registration_finds_the_pose() -> None:
     moved = REGISTER(new, seen_from(old, there), there, prior)
     np.testing.assert_allclose(moved.pose, found.pose + there, atol=1e-3)
     np.testing.assert_allclose(moved.information, found.information, rtol=0.02, atol=0.005 * found.information.max())
+
+
+def test_the_back_of_a_partition_is_not_seen() -> None:
+    """A surface of both faces of a wall 6 cm thick: a scan of one is laid onto that one, however near the other is."""
+    y = jnp.linspace(-2.0, 2.0, 81, dtype="float32")
+
+    def face(x: float, normal: float) -> Surface:
+        return Surface(
+            position=jnp.stack([jnp.full_like(y, x), y], -1),
+            normal=jnp.stack([jnp.full_like(y, normal), jnp.zeros_like(y)], -1),
+            flat=jnp.ones(81, bool),
+            valid=jnp.ones(81, bool),
+        )
+
+    near, back = face(2.0, -1.0), face(2.06, 1.0)
+    both = jax.tree.map(lambda *x: jnp.concatenate(x), near, back)
+    # Seen from the origin, 4 cm too far away: nearer to the back than to its own face.
+    guess = jnp.asarray([0.04, 0.0, 0.0], "float32")
+    found = REGISTER(near, both, guess, 1e-2 * jnp.eye(3, dtype="float32"))
+    assert abs(float(found.pose[0])) < 0.002
+    assert found.share > 0.9
+    # Behind the partition it is the other way round.
+    behind = face(-1.94, 1.0)
+    found = REGISTER(behind, both, jnp.asarray([3.97, 0.0, 0.0], "float32"), 1e-2 * jnp.eye(3, dtype="float32"))
+    assert abs(float(found.pose[0]) - 4.0) < 0.002
 
 
 def test_along_a_corridor_registration_holds_to_the_guess() -> None:
@@ -439,7 +466,8 @@ def test_what_was_seen_in_a_sweep_errs_with_it() -> None:
     root = np.array([[0.03, 0.0, 0.0], [0.01, 0.02, 0.0], [-0.004, 0.006, 0.01]])
     here = Pose(mean=jnp.asarray(pose), cov=jnp.diag(jnp.asarray([0.02, 0.02, 0.005]) ** 2))
     see = jax.jit(partial(sightings_of_scan, thresholds=Thresholds(), noise=SensorNoise()))
-    still, moving = (see(scan, here, lines, 7, jnp.asarray(cov)) for cov in (np.zeros((3, 3)), root @ root.T))
+    known = LineMap(lines=lines, circles=poles_at([], room=2))
+    still, moving = (see(scan, here, known, 7, jnp.asarray(cov))[0] for cov in (np.zeros((3, 3)), root @ root.T))
     assert still.valid.sum() >= 3
     for i in np.flatnonzero(still.valid):
         anchor, angle = np.asarray(still.anchor[i]), float(still.angle[i])
@@ -454,6 +482,74 @@ def test_what_was_seen_in_a_sweep_errs_with_it() -> None:
         jac = np.stack([(seen(h) - seen(-h)) / 2e-6 for h in 1e-6 * np.eye(3)], -1)
         added = np.asarray(moving.cov[i] - still.cov[i])
         np.testing.assert_allclose(added, jac @ root @ root.T @ jac.T, atol=1e-9)
+
+
+def test_circles_are_seen_where_they_are() -> None:
+    """The sightings of a pole, in the scanner's own frame; and what a sweep adds, by moving it."""
+    pose, pole = np.array([1.0, -0.5, 0.4]), np.array([2.0, 0.2, 0.12])
+    direction = np.stack([np.cos(pose[2] + BEARINGS), np.sin(pose[2] + BEARINGS)], -1)
+    ahead, aside = direction @ (pole[:2] - pose[:2]), direction @ (np.array([[0, -1], [1, 0]]) @ (pole[:2] - pose[:2]))
+    reach = ahead - np.sqrt(np.maximum(pole[2] ** 2 - aside**2, 0))
+    ranges = np.where((np.abs(aside) < pole[2]) & (ahead > 0), reach, ranges_in(ROOM, pose))
+    scan = Scan.from_ranges(jnp.asarray(ranges), jnp.asarray(BEARINGS), range_max=30.0)
+    here = Pose(mean=jnp.asarray(pose), cov=jnp.diag(jnp.asarray([0.02, 0.02, 0.005]) ** 2))
+    known = LineMap(lines=lines_between([], room=8), circles=poles_at([[9, 9, 0.1], [2.01, 0.21, 0.11]], room=4))
+    root = np.array([[0.03, 0.0, 0.0], [0.01, 0.02, 0.0], [-0.004, 0.006, 0.01]])
+    see = jax.jit(partial(sightings_of_scan, thresholds=Thresholds(), noise=SensorNoise()))
+    still, moving = (see(scan, here, known, 7, jnp.asarray(cov))[1] for cov in (np.zeros((3, 3)), root @ root.T))
+    (i,) = np.flatnonzero(still.valid)
+    assert (int(still.keyframe[i]), int(still.circle[i])) == (7, 1)
+    expected = between(pose, [*pole[:2], 0.0])[:2]
+    np.testing.assert_allclose(still.at[i], [*expected, 0.12], atol=0.004)
+
+    def seen(error: np.ndarray) -> np.ndarray:
+        return np.append(compose(error, [*np.asarray(still.at[i, :2]), 0.0])[:2], 0.12)
+
+    jac = np.stack([(seen(h) - seen(-h)) / 2e-6 for h in 1e-6 * np.eye(3)], -1)
+    np.testing.assert_allclose(moving.cov[i] - still.cov[i], jac @ root @ root.T @ jac.T, atol=1e-9)
+    # The scanner's noise alone: what the pose errs by turns with the keyframe and is not counted here.
+    sure = see(scan, dataclasses.replace(here, cov=here.cov / 100), known, 7, jnp.zeros((3, 3)))[1]
+    np.testing.assert_allclose(sure.cov[i], still.cov[i], rtol=1e-6)
+
+
+def test_circles_are_where_their_sightings_say() -> None:
+    """Against a weighted mean in NumPy: two poles, one of them with a sighting that is of something else."""
+    random = np.random.default_rng(6)
+    truth = np.array([[2.0, 1.0, 0.1], [-3.0, 4.0, 0.2]])
+    poses = np.array([[0.0, 0.0, 0.0], [1.0, -1.0, 0.7], [-2.0, 1.0, 2.5], [3.0, 3.0, -2.0]])
+    cov_poses = np.stack([np.diag([1e-4, 2e-4, 1e-5]) * k for k in (1, 2, 3, 4)])
+    root = 0.01 * random.standard_normal((8, 3, 3))
+    cov = root @ root.swapaxes(-1, -2) + 1e-5 * np.eye(3)
+    number, circle = np.tile(np.arange(4), 2), np.repeat([0, 2], 4)
+    at, informations, pulls = [], np.zeros((2, 3, 3)), np.zeros((2, 3))
+    for k in range(8):
+        pose, i = poses[number[k]], k // 4
+        c, s = np.cos(pose[2]), np.sin(pose[2])
+        turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+        place = turn.T @ (truth[i] - [*pose[:2], 0]) + random.multivariate_normal(np.zeros(3), cov[k])
+        place[:2] += 5.0 if k == 6 else 0.0
+        at.append(place)
+        lever = turn[:2, :2] @ place[:2]
+        moves = np.array([[1, 0, -lever[1]], [0, 1, lever[0]], [0, 0, 0]])
+        if k != 6:
+            weight = np.linalg.inv(turn @ cov[k] @ turn.T + moves @ cov_poses[number[k]] @ moves.T)
+            informations[i] += weight
+            pulls[i] += weight @ (turn @ place + [*pose[:2], 0])
+    begin = poles_at([[2.03, 0.98, 0.12], [9.0, 9.0, 0.1], [-3.02, 4.02, 0.18]], room=5)
+    sightings = CircleSightings(
+        keyframe=jnp.asarray(np.append(number, 0)),
+        circle=jnp.asarray(np.append(circle, 0)),
+        at=jnp.asarray(np.concatenate([at, np.zeros((1, 3))])),
+        cov=jnp.asarray(np.concatenate([cov, np.eye(3)[None]])),
+        valid=jnp.asarray(np.append(np.ones(8, bool), False)),
+    )
+    after = jax.jit(circles_from_sightings)(begin, jnp.asarray(poses), jnp.asarray(cov_poses), sightings)
+    for slot, information, pull in zip((0, 2), informations, pulls, strict=True):
+        found = np.append(after.center[slot], after.radius[slot])
+        np.testing.assert_allclose(found, np.linalg.solve(information, pull), atol=1e-9)
+        np.testing.assert_allclose(after.cov[slot], np.linalg.inv(information), rtol=1e-8, atol=1e-14)
+    np.testing.assert_array_equal(after.center[1], begin.center[1])
+    np.testing.assert_array_equal(after.cov[1], begin.cov[1])
 
 
 def tracked(corners: list[np.ndarray], poses: np.ndarray, odometry: np.ndarray) -> list[Any]:

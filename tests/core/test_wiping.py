@@ -32,7 +32,7 @@ from linemap_jax.core.wiping import (
 
 remaining_jit = jax.jit(remaining)
 swath_jit = jax.jit(swath_of_scan)
-passed_jit = jax.jit(passed_through)
+passed_jit = jax.jit(passed_through, static_argnames="rules")
 NUMBER = st.integers(-40, 40).map(lambda i: i / 8)
 
 
@@ -315,8 +315,29 @@ def test_beams_never_wipe_the_line_that_they_measure(own: int, gone: bool) -> No
     points = points_from_scan(Scan.from_ranges(WALL, BEARINGS), HERE, Mount(), jacobians="analytic")
     swath = swath_jit(points, HERE, jnp.zeros(91, jnp.int32), found, jnp.array([own]), jnp.array([1]), Thresholds())
     line = jax.tree.map(lambda x: x[0], lines_of(([2.8, -1.0], [2.8, 1.0])))
-    _, _, which = passed_jit(line, jnp.array(0), swath, HERE.cov, Thresholds(), SensorNoise())
+    _, _, which = passed_jit(line, jnp.array(0), swath, HERE.cov, Thresholds(), SensorNoise(), Rules())
     assert bool(which.any()) == gone
+
+
+def test_a_wall_does_not_wipe_its_own_back() -> None:
+    """Beams reach a little behind what they measure, but only what is seen from this side is gone there."""
+    found = lines_of(([3.0, -3.0], [3.0, 3.0]), capacity=1)
+    points = points_from_scan(Scan.from_ranges(WALL, BEARINGS), HERE, Mount(), jacobians="analytic")
+    swath = swath_jit(points, HERE, jnp.zeros(91, jnp.int32), found, jnp.array([1]), jnp.array([1]), Thresholds())
+
+    def wiped(begin: list[float], end: list[float], **rules: bool) -> bool:
+        line = jax.tree.map(lambda x: x[0], lines_of((begin, end)))
+        which = passed_jit(line, jnp.array(0), swath, HERE.cov, Thresholds(), SensorNoise(), Rules(**rules))[2]
+        looked_at = may_have_passed(line, jnp.array(0), swath, Thresholds(), Rules(**rules))
+        assert bool(looked_at) == bool(which.any())
+        return bool(looked_at)
+
+    near, far, before = (([x, -1.0], [x, 1.0]) for x in (3.03, 3.3, 2.7))
+    assert (wiped(*near), wiped(*near[::-1]), wiped(*near[::-1], tell_sides=False)) == (True, False, True)
+    assert not wiped(*far)
+    # What a beam has seen through is gone, from whatever side it was seen.
+    assert wiped(*before)
+    assert wiped(*before[::-1])
 
 
 @pytest.mark.parametrize(
@@ -374,7 +395,7 @@ def test_a_beam_passed_if_it_ended_beyond_the_line_by_the_spread_of_that() -> No
     for sigmas, gone in ((0.999, True), (1.001, False)):
         # Of the two beams the one with the larger spread decides.
         gates = Thresholds(wipe_sigmas=sigmas * beyond / spread.max(), match_distance=0.0)
-        assert bool(passed_jit(line, jnp.array(0), swath, where.cov, gates, noise)[2][0]) == gone
+        assert bool(passed_jit(line, jnp.array(0), swath, where.cov, gates, noise, Rules())[2][0]) == gone
 
 
 def test_a_line_that_two_beams_passed_is_looked_at() -> None:
@@ -384,6 +405,6 @@ def test_a_line_that_two_beams_passed_is_looked_at() -> None:
     swath = swath_jit(points, HERE, jnp.full(91, -1), lines_of(capacity=1), none, none, Thresholds())
     for end, two in ((0.045, True), (0.025, False)):  # beams at y = 0 and 0.035
         line = jax.tree.map(lambda x: x[0], lines_of(([2.0, -0.01], [2.0, end])))
-        gone = passed_jit(line, jnp.array(0), swath, HERE.cov, Thresholds(), SensorNoise())[2]
+        gone = passed_jit(line, jnp.array(0), swath, HERE.cov, Thresholds(), SensorNoise(), Rules())[2]
         assert bool(gone.any()) == two
-        assert bool(may_have_passed(line, jnp.array(0), swath, Thresholds())) == two
+        assert bool(may_have_passed(line, jnp.array(0), swath, Thresholds(), Rules())) == two

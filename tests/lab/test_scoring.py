@@ -182,6 +182,19 @@ def test_two_lines_of_one_wall(second: tuple[float, float], pieces: int, twice: 
     assert bool(score.held_twice[0]) == (twice > 0.3)
 
 
+@pytest.mark.parametrize("kind", list(Kind))
+def test_a_chain_has_two_faces(kind: Kind) -> None:
+    square = jnp.array([[-2.0, -2.0], [2.0, -2.0], [2.0, 2.0], [-2.0, 2.0]])
+    world = world_of(polygon(square, kind))
+    there, back, again = [(-1, -2), (1, -2)], [(1, -2.01), (-1, -2.01)], [(-1, -1.99), (1, -1.99)]
+    both = scored(map_of(lines_of(there, back), circles_of()), world)
+    assert bool(both.held_twice[0]) == (kind != Kind.WALL)
+    assert float(both.wall_held[0]) == pytest.approx(2.1, abs=0.012)
+    assert int(both.wall_pieces[0]) == 1
+    one_face = scored(map_of(lines_of(there, again), circles_of()), world)
+    assert bool(one_face.held_twice[0])
+
+
 def test_an_empty_map() -> None:
     empty = scored(map_of(lines_of(), circles_of()), ROOM)
     assert float(empty.recall) == 0

@@ -18,10 +18,10 @@ from linemap_jax.core.estimation.pose_graph import PoseGraph
 from linemap_jax.core.extract import extract
 from linemap_jax.core.fields import documented
 from linemap_jax.core.frames import between, dot, perp, rotate, unit, wrap_angle
-from linemap_jax.core.matching import best_line, with_sign
-from linemap_jax.core.propagation import apply, inverse, propagate, square_root, symmetric
-from linemap_jax.core.settings import SCAN_CAPACITY, Capacity, Method, Number, SensorNoise, Thresholds
-from linemap_jax.core.state import LineMap, Lines, Pose, Scan, pytree
+from linemap_jax.core.matching import best_line, match_circles, with_sign
+from linemap_jax.core.propagation import apply, inverse, propagate, quadratic, square_root, symmetric
+from linemap_jax.core.settings import SCAN_CAPACITY, Capacity, Method, Number, Rules, SensorNoise, Thresholds
+from linemap_jax.core.state import Circles, LineMap, Lines, Pose, Scan, pytree
 
 WIDENING = (100.0, 10.0, 1.0, 1.0, 1.0)
 """Of the gate, in each iteration of Gauss and Newton: the graph is some centimetres off where sightings are good to
@@ -29,6 +29,8 @@ millimetres."""
 GATE = 13.8
 """Squared residual, in sigmas, from which a sighting is none of that line: 99.9 % of chi-square with 2 degrees of
 freedom. Not a kernel that falls: it would take weight from what is right, too, and the covariance would not hold."""
+CIRCLE_GATE = 16.3
+"""The same for circles, with 3 degrees of freedom."""
 _HELD = 1e12  # information on what is not moved
 
 
@@ -46,6 +48,22 @@ class LineSightings:
     """Direction of the normal, which points as that of the line in the map, rad."""
     cov: Float[Array, "O 2 2"]
     """Covariance of (offset, angle) at the anchor, by the scanner's noise alone: m^2, m rad, rad^2."""
+    valid: Bool[Array, " O"]
+    """Which slots are in use."""
+
+
+@pytree
+class CircleSightings:
+    """Fitted circles of the map, each as a keyframe has seen it, in the frame of the scanner."""
+
+    keyframe: Int[Array, " O"]
+    """Number of the keyframe from which the circle was seen."""
+    circle: Int[Array, " O"]
+    """Slot of the circle in the map."""
+    at: Float[Array, "O 3"]
+    """x and y of the centre in the frame of the scanner, and radius, m."""
+    cov: Float[Array, "O 3 3"]
+    """Covariance of these, by the scanner's noise alone, m^2."""
     valid: Bool[Array, " O"]
     """Which slots are in use."""
 
@@ -69,7 +87,7 @@ class Adjusted(NamedTuple):
 def sightings_of_scan(
     scan: Scan,
     pose: Pose,
-    lines: Lines,
+    line_map: LineMap,
     keyframe: Int[Array, ""],
     cov_sweep: Float[Array, "3 3"],
     *,
@@ -77,13 +95,13 @@ def sightings_of_scan(
     noise: SensorNoise,
     capacity: Capacity = SCAN_CAPACITY,
     **method: Unpack[Method],
-) -> LineSightings:
-    """The lines of the map that a keyframe has seen, padded to the capacity of a scan.
+) -> tuple[LineSightings, CircleSightings]:
+    """The lines and fitted circles of the map that a keyframe has seen, padded to the capacity of a scan.
 
     Args:
       scan: of the keyframe.
       pose: of the scanner, with what its neighbours tell of its error; the gates of matching widen by it.
-      lines: of the map.
+      line_map: made from the scans at the poses of the trajectory.
       keyframe: its number.
       cov_sweep: what the scanner's pose in its own frame errs by from one line to another, since it moved while it
         swept; zero for a scan of one instant. m^2, m rad, rad^2.
@@ -93,10 +111,11 @@ def sightings_of_scan(
       **method: as for `extract`.
 
     Returns:
-      The sightings; those of lines that match no line of the map are not valid.
+      The sightings; those of what matches nothing in the map are not valid.
     """
+    lines, rules = line_map.lines, method.get("rules", Rules())
     found = extract(scan, pose, thresholds=thresholds, noise=noise, capacity=capacity, **method)
-    slot, nis = best_line(found.lines, lines, thresholds, "independent")
+    slot, nis = best_line(found.lines, lines, thresholds, "independent", same_side=rules.tell_sides)
     reverse = jnp.abs(wrap_angle(found.lines.angle - lines.angle[slot])) > jnp.pi / 2
     foot = found.lines.anchor + found.lines.offset[:, None] * found.lines.normal - pose.mean[None, :2]
     turn = jnp.where(reverse, jnp.pi, 0).astype(foot.dtype) - pose.mean[2]
@@ -108,13 +127,83 @@ def sightings_of_scan(
         by_pose = jax.jacfwd(residual_of_sighting)(here, jnp.stack([here[0], angle]), anchor, anchor, angle)
         return propagate(by_pose, cov_sweep)
 
-    return LineSightings(
+    of_lines = LineSightings(
         keyframe=jnp.broadcast_to(keyframe, slot.shape),
         line=slot,
         anchor=anchor,
         angle=angle,
         cov=with_sign(found.cov_measurement, sign) + jax.vmap(from_sweep)(anchor, angle),
         valid=found.lines.valid & (nis < thresholds.match_nis),
+    )
+
+    circles, match = found.circles, match_circles(found.circles, line_map.circles, thresholds, rules, "independent")
+    center = rotate(-pose.mean[2], circles.center - pose.mean[None, :2])
+    turned = jnp.broadcast_to(_turned(-pose.mean[2]), circles.cov_independent.shape)
+    of_circles = CircleSightings(
+        keyframe=jnp.broadcast_to(keyframe, match.slot.shape),
+        circle=jnp.maximum(match.slot, 0),
+        at=jnp.concatenate([center, circles.radius[:, None]], -1),
+        cov=propagate(turned, circles.cov_independent) + propagate(jax.vmap(_jac_circle_pose)(center), cov_sweep[None]),
+        valid=circles.valid & circles.fitted & (match.slot >= 0) & line_map.circles.fitted[match.slot],
+    )
+    return of_lines, of_circles
+
+
+def _turned(angle: Float[Array, ""]) -> Float[Array, "3 3"]:
+    """What turns (x, y) by an angle, and leaves the third as it is."""
+    return jnp.eye(3, dtype=angle.dtype).at[:2, :2].set(rotate(angle, jnp.eye(2, dtype=angle.dtype)).T)
+
+
+def _jac_circle_pose(center: Float[Array, "2"]) -> Float[Array, "3 3"]:
+    """d(x, y, radius) of a circle / d(x, y, theta) of the pose that it moves with, seen from there."""
+    identity = jnp.eye(2, dtype=center.dtype)
+    return jnp.zeros((3, 3), center.dtype).at[:2, :2].set(identity).at[:2, 2].set(perp(center))
+
+
+def circles_from_sightings(
+    circles: Circles, poses: Float[Array, "N 3"], cov_poses: Float[Array, "N 3 3"], sightings: CircleSightings
+) -> Circles:
+    """Fitted circles where the keyframes that have seen them say that they are: the weighted mean of the sightings.
+
+    The errors of the poses count in the weights as if they were independent; what they have in common is left to
+    `with_error_of_poses`. Sightings that do not fit are left out, as in `adjust`.
+
+    Args:
+      circles: of the map.
+      poses: of the keyframes. m, m, rad.
+      cov_poses: of these: m^2, m rad, rad^2.
+      sightings: of these circles from these keyframes.
+
+    Returns:
+      The circles; those without a sighting that fits stay as they are.
+    """
+    pose, k = poses[sightings.keyframe], circles.valid.shape[0]
+    center = jax.vmap(rotate)(pose[:, 2], sightings.at[:, :2])
+    turned = jax.vmap(_turned)(pose[:, 2])
+    of_poses = propagate(jax.vmap(_jac_circle_pose)(center), cov_poses[sightings.keyframe])
+    information = inverse(propagate(turned, sightings.cov) + of_poses)
+    seen = jnp.concatenate([pose[:, :2] + center, sightings.at[:, 2:]], -1)
+
+    def iterate(at: Array, widening: Array) -> tuple[Array, Array]:
+        off = seen - at[sightings.circle]
+        fits = sightings.valid & (quadratic(off, information) < widening * CIRCLE_GATE)
+        weight = jnp.where(fits[:, None, None], information, 0)
+        total = jnp.zeros((k, 3, 3), at.dtype).at[sightings.circle].add(weight)
+        pull = jnp.zeros((k, 3), at.dtype).at[sightings.circle].add(apply(weight, seen))
+        moved = jnp.linalg.det(total) > 0
+        return jnp.where(moved[:, None], apply(inverse(total), pull), at), total
+
+    begin = jnp.concatenate([circles.center, circles.radius[:, None]], -1)
+    at, total = jax.lax.scan(iterate, begin, jnp.asarray(WIDENING, begin.dtype))
+    total = total[-1]
+    moved = (circles.valid & circles.fitted & (jnp.linalg.det(total) > 0))[:, None]
+    cov = jnp.where(moved[..., None], inverse(total), circles.cov_independent)
+    return dataclasses.replace(
+        circles,
+        center=jnp.where(moved, at[:, :2], circles.center),
+        radius=jnp.where(moved[:, 0], at[:, 2], circles.radius),
+        cov_independent=cov,
+        sqrt_persistent=jnp.where(moved[..., None], 0, circles.sqrt_persistent),
     )
 
 
@@ -299,7 +388,7 @@ def with_error_of_poses(
 
     def of_circle(center: Array) -> Array:
         lever, cov = nearest_pose(center)
-        return propagate(jnp.zeros((3, 3), cov.dtype).at[:2, :2].set(jnp.eye(2)).at[:2, 2].set(lever), cov)
+        return propagate(_jac_circle_pose(-perp(lever)), cov)
 
     lines, circles = line_map.lines, line_map.circles
     dtype = lines.offset.dtype

@@ -276,7 +276,8 @@ def localize(
     """
     odometry, thresholds, noise = odometry or OdometryNoise(), thresholds or Thresholds(), noise or SensorNoise()
     mount, settings = mount or Mount(), settings or LocalizationSettings()
-    rules = method.get("rules", Rules())
+    # A map that somebody has drawn does not say from where its lines are seen.
+    rules = dataclasses.replace(method.get("rules", Rules()), tell_sides=False)
     lines = directed(line_map.lines)
 
     def step(belief: Belief, x: tuple[Scan, Array, Array, Array]) -> tuple[Belief, Located]:

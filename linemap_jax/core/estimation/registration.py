@@ -98,11 +98,14 @@ def _pull(
 ) -> tuple[Float[Array, "3 3"], Float[Array, "3"], Float[Array, ""]]:
     """The normal equations of one Gauss-Newton step: information, right-hand side; and the share that agrees."""
     here = seen_from(new, pose)
-    neighbour = nearest(here.position, surface.position, surface.valid)
+    # The back of a wall is not seen, and may be nearer than its front.
+    in_front = dot(surface.normal, pose[None, :2] - surface.position) > 0
+    visible = surface.valid & (in_front | ~surface.flat)
+    neighbour = nearest(here.position, surface.position, visible)
     normal, flat = surface.normal[neighbour], surface.flat[neighbour]
     off = here.position - surface.position[neighbour]
     one_wall = dot(here.normal, normal) > jnp.cos(settings.flat_angle)
-    used = new.valid & surface.valid[neighbour] & (dot(off, off) < gate**2) & (one_wall | ~(flat & new.flat))
+    used = new.valid & visible[neighbour] & (dot(off, off) < gate**2) & (one_wall | ~(flat & new.flat))
 
     lever = perp(here.position - pose[None, :2])
     information, pull, distance = jnp.zeros((3, 3), pose.dtype), jnp.zeros(3, pose.dtype), []

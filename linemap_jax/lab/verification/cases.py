@@ -51,6 +51,13 @@ class Run:
         rest = np.stack([np.arange(size - len(self.points)), np.ones(size - len(self.points))], -1)
         return np.concatenate([self.points, rest])
 
+    def counter_clockwise(self, center: Float[np.ndarray, "2"]) -> "Run":
+        """The points in the order in which the pipeline holds them: most steps turn left, seen from a centre."""
+        ray = self.points - center
+        turns = ray[:-1, 0] * ray[1:, 1] - ray[:-1, 1] * ray[1:, 0]
+        falling = np.sum(np.sign(turns)) < 0
+        return dataclasses.replace(self, points=self.points[::-1]) if falling else self
+
     @property
     def count(self) -> np.ndarray:
         """Number of points. Shape `[]`."""
@@ -107,10 +114,11 @@ def beams(random: np.random.Generator) -> Iterator[tuple[Run, np.ndarray, np.nda
             pose = np.array([*position, random.uniform(-np.pi, np.pi)])
             c, s = np.cos(pose[2]), np.sin(pose[2])
             laser = np.array([c * mount[0] - s * mount[1], s * mount[0] + c * mount[1]])
-            ray = run.padded - laser
+            swept = run.counter_clockwise(laser)
+            ray = swept.padded - laser
             bearing = np.arctan2(ray[:, 1], ray[:, 0]) - pose[2] - mount[2]
             measurements = np.stack([np.hypot(ray[:, 0], ray[:, 1]), bearing], -1)
-            named = dataclasses.replace(run, name=f"{run.name}, robot {place}")
+            named = dataclasses.replace(swept, name=f"{run.name}, robot {place}")
             yield named, pose, measurements, mount
 
 

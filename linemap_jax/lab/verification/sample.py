@@ -48,10 +48,14 @@ class Sample:
 
 
 def draw(random: np.random.Generator) -> Sample:
-    """Walls in all directions, 1 to 8 m away, 1.4 m long, with 1 cm of noise in the ranges. All in NumPy's arrays."""
+    """Walls in all directions, 1 to 8 m away, 1.4 m long, with 1 cm of noise in the ranges. All in NumPy's arrays.
+
+    Each is swept counter-clockwise, the order in which the pipeline holds points.
+    """
     reach, towards = random.uniform(1, 8, WALLS), random.uniform(-np.pi, np.pi, WALLS)
     direction = np.linspace(0, 2 * np.pi, WALLS, endpoint=False)
     middle = reach[:, None] * np.stack([np.cos(towards), np.sin(towards)], -1)
+    direction += np.where(np.sin(direction - towards) < 0, np.pi, 0)
     along = np.linspace(-0.7, 0.7, SIZE)[None, :, None]
     points = middle[:, None] + along * np.stack([np.cos(direction), np.sin(direction)], -1)[:, None]
     x, y = np.moveaxis(points.reshape(-1, 2), -1, 0)
