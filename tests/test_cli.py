@@ -431,6 +431,10 @@ def test_a_folder_is_not_a_log(refuse, tmp_path):
     assert refuse("build", tmp_path, "-o", tmp_path / "out").endswith(
         "its metadata.yaml; it holds drive_0.mcap, which can be given by itself"
     )
+    (tmp_path / "metadata.yaml").write_text("rosbag2_bagfile_information:\n")
+    assert refuse("build", tmp_path / "metadata.yaml", "-o", tmp_path / "out") == (
+        f"{tmp_path / 'metadata.yaml'}: describes a ROS 2 bag, which is its folder: give that"
+    )
 
 
 def test_help_that_nobody_reads_ends_quietly():

@@ -109,6 +109,14 @@ def test_the_way_through_a_room_and_out_of_the_map(room: dict[str, Any], capsys:
     assert np.all(np.diff(sigma[KNOWN:, 0]) > 0)
 
 
+def test_where_it_begins_is_told(room: dict[str, Any], tmp_path: Path, capsys: Any) -> None:
+    for options, told in (([], True), (["--quiet"], False), (["--start", "1", "1.2", "0.3"], False)):
+        path = tmp_path / f"{len(options)}.tum"
+        assert main(["localize", str(room["map"]), str(room["log"]), "-o", str(path), *options]) == 0
+        sentence = "linemap: without --start the first pose of the log is taken: 0.00 0.00 0.00\n"
+        assert (sentence in capsys.readouterr().err) == told
+
+
 def test_what_is_refused(room: dict[str, Any], tmp_path: Path, capsys: Any) -> None:
     log, here = str(room["log"]), str(room["map"])
     empty = LineMap(lines=lines_between([], room=2), circles=poles_at([]))

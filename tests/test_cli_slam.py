@@ -100,8 +100,10 @@ def test_a_drive_around_a_block(drive: Drive, run: Callable[..., Any], tmp_path:
     assert told["times_real_time"] == pytest.approx(0.25e6 * (SCANS - 1) / SCANS / told["us_per_scan"])
     assert told["us_per_scan"] > 0
     assert found.pose_frame == "laser"
-    lost = np.loadtxt(tmp_path / "out" / "trajectory.csv", delimiter=",", skiprows=1)[:, -1]
-    assert lost[0] == 0  # before it there is nothing to agree with
+    table = np.genfromtxt(tmp_path / "out" / "trajectory.csv", delimiter=",", names=True)
+    assert table["lost"][0] == 0  # before it there is nothing to agree with
+    assert table["keyframe"][0] == 1
+    assert table["keyframe"].sum() == told["keyframes"]
 
     line_map, settings = read_map(tmp_path / "out" / "map.json", dtype="float32")
     lines = jax.tree.map(np.asarray, line_map.lines)
@@ -229,6 +231,6 @@ def test_a_robot_that_is_carried_away(drive: Drive, run: Callable[..., Any], tmp
     assert np.isfinite(poses).all()
     np.testing.assert_allclose(poses[0], drive.odometry[0], atol=1e-4)
     columns = np.loadtxt(tmp_path / "out" / "trajectory.csv", delimiter=",", skiprows=1)
-    assert columns.shape == (80, 11)
+    assert columns.shape == (80, 12)
     assert np.isfinite(columns).all()
     assert columns[40, -1] == 1

@@ -10,7 +10,7 @@ import tyro
 from linemap_jax.cli.compilations import keep_compilations
 from linemap_jax.cli.logs import mount_of, opened, warn
 from linemap_jax.cli.options import MOST_SCANS, LogInput, UsageError, check_input
-from linemap_jax.cli.output import check_output, make_folder
+from linemap_jax.cli.output import check_output, make_folder, say
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -28,7 +28,7 @@ class Calibrate(LogInput):
     overwrite: bool = False
     """Replace output that is there already."""
     quiet: bool = False
-    """No warnings."""
+    """No progress, no warnings."""
     json: bool = False
     """Print the result as JSON."""
 
@@ -56,6 +56,7 @@ class Calibrate(LogInput):
         mount = mount_of(self, log, quiet=self.quiet)
         chunk = next(chunks_of_readings(log, self.scans, cov_pose=np.zeros((3, 3)), dtype="float64"))
         warn(log, quiet=self.quiet)
+        say(f"{len(chunk.timestamps)} scans read; estimating, which takes a minute", quiet=self.quiet)
         try:
             sensor = sensor_noise(chunk.scans)
             noise = SensorNoise(range_sigma=float(sensor.sigma[0]), bearing_sigma=float(sensor.sigma[1]))

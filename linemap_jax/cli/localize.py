@@ -45,6 +45,7 @@ class Localize(LogOptions):
     """How much worse the wheels count than is usual indoors; a factor of all their standard deviations."""
     json: bool = False
     """Print the summary as JSON."""
+    pose_sigma: tyro.conf.Suppress[tuple[float, float, float]] = (0.05, 0.05, 0.01)
 
     def run(self) -> int:
         """Localise, and give the exit status."""
@@ -144,6 +145,9 @@ def _way_through(command: Localize, log: "Log", line_map: "LineMap", options: di
             if belief is None:
                 start = np.asarray(chunk.poses.mean[0] if command.start is None else command.start, command.dtype)
                 cov = np.diag(np.square(np.asarray(command.start_sigma, command.dtype)))
+                if command.start is None:
+                    pose = " ".join(f"{x:.2f}" for x in start.tolist())
+                    say(f"without --start the first pose of the log is taken: {pose}", quiet=command.quiet)
                 belief = believe(Pose(mean=jnp.asarray(start), cov=jnp.asarray(cov)), line_map)
                 last = (counted[0], float(chunk.timestamps[0]))
             assert last is not None

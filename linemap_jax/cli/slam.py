@@ -40,10 +40,13 @@ class Slam(LogOptions):
     """Whose poses trajectory.tum and .csv hold: the laser's, or the robot's."""
     json: bool = False
     """Print the summary as JSON."""
+    pose_sigma: tyro.conf.Suppress[tuple[float, float, float]] = (0.05, 0.05, 0.01)
 
     def run(self) -> int:
         """Track, close loops, map, adjust; and give the exit status."""
         options: dict[str, Any] = options_of_update(self) | {"pose_error": "unknown"}
+        import numpy as np
+
         from linemap_jax.core.settings import Mount
         from linemap_jax.io.map_file import write_map
         from linemap_jax.io.plot import plot_map
@@ -76,7 +79,6 @@ class Slam(LogOptions):
         settings = {
             "log": self.log.name,
             "preset": self.preset,
-            "pose_sigma": self.pose_sigma,
             "slam": {
                 "keyframes": len(slammed.keyframes),
                 "loops": slammed.closures,
@@ -92,7 +94,10 @@ class Slam(LogOptions):
             poses, covs = _of_base(trajectory, covs, mount)
         whose = "robot" if self.trajectory_frame == "base" else "laser"
         write_tum(files[2], stamps, poses, pose_frame=whose, overwrite=self.overwrite)
-        write_covariances(files[3], stamps, poses, covs, _doubtful(slammed), overwrite=self.overwrite)
+        is_keyframe = np.isin(np.arange(len(stamps)), slammed.scan_of_keyframe)
+        write_covariances(
+            files[3], stamps, poses, covs, _doubtful(slammed), keyframes=is_keyframe, overwrite=self.overwrite
+        )
         if interrupted:
             print(f"linemap: interrupted; map and trajectory so far are in {self.output}", file=sys.stderr)
             return 130

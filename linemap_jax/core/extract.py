@@ -158,7 +158,13 @@ def usable(scan: Scan, pose: Pose) -> tuple[Scan, Pose, Bool[Array, ""]]:
 
     Returns:
       The scan, the pose, and whether the pose was finite.
+
+    Raises:
+      ValueError: at trace time, for a pose of another shape.
     """
+    for name, shape in (("mean", (3,)), ("cov", (3, 3))):
+        if getattr(pose, name).shape != shape:
+            raise ValueError(f"pose.{name} must have shape {shape}, not {getattr(pose, name).shape}")
     variance = jnp.diagonal(pose.cov)
     finite = jnp.all(jnp.abs(pose.mean) <= LARGEST) & jnp.all((variance >= 0) & (variance <= LARGEST))
     finite &= jnp.all(pose.cov**2 <= ONE_AND_ROUNDING * variance[:, None] * variance[None])

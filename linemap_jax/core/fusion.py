@@ -171,7 +171,8 @@ def fuse_lines(
       thresholds: `end_sigmas`.
       rules: `estimate_ends`.
       pose_error: its model.
-      share: of the pose error that persists; the rest counts as independent once the pieces have been combined.
+      share: of the pose error that persists; the rest counts as independent once the pieces have been combined. Where
+        nothing persists it is 0: with "independent" and 0 this is Eq. (23).
 
     Returns:
       The improved lines, one for each piece. Rows of `together` that are empty give nonsense.

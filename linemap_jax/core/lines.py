@@ -112,7 +112,9 @@ def line_from_regression(fit: Regression, anchor: Float[Array, "K 2"]) -> Float[
       anchor: in the coordinates of the points. Shape `[K, 2]`.
 
     Returns:
-      Offsets in metres and angles of the normals in radians, shape `[2, K]`.
+      Offsets in metres and angles of the normals in radians, shape `[2, K]`. The direction from the first point to the
+      last one lies 90 degrees to the left of the normal; the paper's, with rho >= 0, is the opposite one where the
+      offset from the origin is negative.
     """
     tangent = fit.direction / jnp.sqrt(dot(fit.direction, fit.direction))[:, None]
     normal = -perp(tangent)
@@ -199,7 +201,8 @@ def jac_line_regression(fit: Regression, anchor: Float[Array, "K 2"]) -> Float[A
       anchor: of each line, held fixed, m. Shape `[K, 2]`.
 
     Returns:
-      H of each line; m, without unit, and rad, rad/m. Shape `[K, 2, 2]`.
+      H of each line; m, without unit, and rad, rad/m. Shape `[K, 2, 2]`. The offset has the sign that
+      `line_from_regression` says: for rho the first row is multiplied by that sign.
     """
     a = fit.slope
     norm2 = 1 + a * a

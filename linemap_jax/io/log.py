@@ -93,6 +93,8 @@ def open_log(
         from linemap_jax.io import bags  # Its libraries take a while to load.
 
         return bags.BagLog(path, options, progress=progress)
+    if Path(path).name == "metadata.yaml":
+        raise LogError(path, "describes a ROS 2 bag, which is its folder: give that")
     for start, what in _FOREIGN.items():
         if magic.startswith(start):
             raise LogError(path, what)

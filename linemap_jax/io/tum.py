@@ -96,6 +96,7 @@ def write_covariances(
     covs: ArrayLike,
     lost: ArrayLike,
     *,
+    keyframes: ArrayLike | None = None,
     overwrite: bool = False,
 ) -> None:
     """Write what a trajectory has no place for, as a table with a head, one pose a line, fields separated by commas.
@@ -106,17 +107,21 @@ def write_covariances(
       poses: x, y, theta. m, m, rad. Shape `[T, 3]`.
       covs: of the poses. m^2, m rad, rad^2. Shape `[T, 3, 3]`.
       lost: whether the pose is said to be wrong. Shape `[T]`.
+      keyframes: which of them are keyframes; no such column unless given. Shape `[T]`.
       overwrite: whether an older file may be replaced.
 
     Raises:
       OutputError: if the file exists and `overwrite` is false, or if it cannot be written.
     """
     upper = np.asarray(covs, float)[:, *np.triu_indices(3)]
-    head = "timestamp,x,y,theta,cov_xx,cov_xy,cov_xtheta,cov_yy,cov_ytheta,cov_thetatheta,lost\n"
-    rows = zip(np.asarray(timestamps, float), np.asarray(poses, float), upper, np.asarray(lost, int), strict=True)
+    marks = {"keyframe": keyframes} if keyframes is not None else {}
+    marks |= {"lost": lost}
+    head = f"timestamp,x,y,theta,cov_xx,cov_xy,cov_xtheta,cov_yy,cov_ytheta,cov_thetatheta,{','.join(marks)}\n"
+    marked = np.stack([np.asarray(mark, int) for mark in marks.values()], -1)
+    rows = zip(np.asarray(timestamps, float), np.asarray(poses, float), upper, marked, strict=True)
     text = "".join(
-        f"{t:.6f},{','.join(f'{x:.9f}' for x in pose)},{','.join(f'{c:.9g}' for c in cov)},{is_lost}\n"
-        for t, pose, cov, is_lost in rows
+        f"{t:.6f},{','.join(f'{x:.9f}' for x in pose)},{','.join(f'{c:.9g}' for c in cov)},{','.join(map(str, mark))}\n"
+        for t, pose, cov, mark in rows
     )
     with atomic_write(path, overwrite=overwrite) as temporary:
         temporary.write_text(head + text, encoding="ascii", newline="\n")

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from linemap_jax import Capacity, empty_map, extract, preset, update
+from linemap_jax.core.extract import usable
 from linemap_jax.core.sensor import (
     cov_measurement,
     cov_point,
@@ -212,6 +213,22 @@ def test_a_pose_that_is_not_finite_changes_nothing(field: str, bad: float) -> No
     assert np.all(np.asarray(report.line_slot) == LEFT_OUT)
     counts = (report.added, report.fused, report.merged, report.trimmed, report.split, report.deleted)
     assert not any(int(count) for count in counts)
+
+
+@pytest.mark.parametrize(
+    ("mean", "cov", "told"),
+    [
+        (jnp.zeros(3), jnp.ones(3), r"pose.cov must have shape \(3, 3\), not \(3,\)"),
+        (jnp.zeros(2), jnp.eye(3), r"pose.mean must have shape \(3,\), not \(2,\)"),
+    ],
+)
+def test_a_pose_of_another_shape_is_refused(mean: Any, cov: Any, told: str) -> None:
+    """Before anything of jax complains; without the checks of types that the tests switch on."""
+    pose = object.__new__(Pose)
+    object.__setattr__(pose, "mean", mean)
+    object.__setattr__(pose, "cov", cov)
+    with pytest.raises(ValueError, match=told):
+        usable(room(), pose)
 
 
 def test_an_empty_scan_changes_no_map() -> None:
