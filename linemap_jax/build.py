@@ -30,10 +30,10 @@ COMPILER_OPTIONS = {
 }
 """What a map step is compiled with on a CPU (jax 0.8.3); other devices do not look at these options.
 
-XLA's older loop emitters compile its many small kernels in half the time, and they run nearly twice as fast. A reduction
-over more than 32 numbers would be cut into pieces of 32 for the sake of rounding, each a kernel that cannot be fused with
-what it reduces: here beams and slots are counted and the least of many is sought, which does not round, and a step takes
-a third longer. Where the processor has vectors of 512 bits they save another seventh; where not, nothing changes.
+XLA's older loop emitters compile its many small kernels in half the time, and they run nearly twice as fast. A
+reduction over more than 32 numbers would be cut into pieces of 32 for the sake of rounding, each a kernel that cannot
+be fused with what it reduces: here beams and slots are counted and the least of many is sought, which does not round,
+and a step would take half as long again. Where the processor has vectors of 512 bits they save another seventh.
 """
 
 _jit = partial(jax.jit, static_argnames=STATIC, compiler_options=COMPILER_OPTIONS)

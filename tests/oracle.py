@@ -1719,21 +1719,29 @@ def match_circle(
 
 
 def _wiped_by_beams(circles: Circles, slot: int, sweep: Sweep, *, thresholds: Any) -> bool:
-    """Whether beams have passed through the place of a circle, and none has ended at it or before it."""
+    """Whether beams have passed through the place of a circle, and none has ended at it or before it.
+
+    Wherever it may stand, a beam must have met it: it is pushed from one end of its window to the other.
+    """
     sigmas = float(thresholds.wipe_sigmas)
     radius = circles.radius[slot]
     o = circles.center[slot] - sweep.p
     c = o - sweep.laser
     rc = math.hypot(*c)
     along, across = sweep.u @ c, sweep.u[:, 0] * c[1] - sweep.u[:, 1] * c[0]
-    if rc == 0.0 or 2 * radius < sweep.spacing * rc:
+    if rc == 0.0:
         return False
     u = c / rc
     cov = sandwich(jac_point_pose(o), sweep.cov_pose)
     width = radius + sigmas * math.sqrt(perp(u) @ cov @ perp(u) + rc**2 * sweep.sa**2)
     depth = radius + sigmas * math.sqrt(sweep.sr**2 + u @ cov @ u)
     evidence = (np.abs(across) < width) & (along > 0)
-    return bool(evidence.sum() >= 2 and (sweep.r[evidence] > along[evidence] + depth).all())
+    if evidence.sum() < 2 or not (sweep.r[evidence] > along[evidence] + depth).all():
+        return False
+    seen, shift = np.sort(across[evidence]), width - radius
+    left = np.concatenate([[-np.inf], seen, [np.inf]])  # the free room between neighbouring beams
+    room = (left[:-1] + radius, left[1:] - radius)  # for centres
+    return not bool(np.any((room[0] < room[1]) & (room[0] < shift) & (room[1] > -shift)))
 
 
 def _inside(point: np.ndarray, triangle: np.ndarray) -> bool:

@@ -253,6 +253,8 @@ def test_what_is_refused(built: Path, refuse: Any, tmp_path: Path) -> None:
     assert "--resolution must be positive" in refuse("export", good, "-o", to, "--resolution", 0)
     assert "million cells" in refuse("export", good, "-o", tmp_path / "m.yaml", "--log", log, "--resolution", 1e-4)
     assert "cannot be read: No such file" in refuse("export", good, "-o", to, "--log", tmp_path / "none.log")
+    told = refuse("compare", good, good, "--log-a", log, "--poses-b", to)
+    assert told == "--poses-b is for --log-b, which is not given"
 
     broken = document(good)
     broken["lines"][0]["cov_independent"][0][0] = -1.0

@@ -37,6 +37,12 @@ class Compare(LogInput):
     """Log of the map before: whether its beams went through where something has appeared."""
     log_b: Annotated[Path | None, tyro.conf.arg(metavar="LOG")] = None
     """Log of the map after: whether its beams went through where something has vanished, or did not look there."""
+    poses_a: Annotated[Path | None, tyro.conf.arg(metavar="FILE.tum")] = None
+    """Poses for the log of the map before, in place of those that it states; of the robot, or, if a comment in the file
+    says so, of the laser."""
+    poses_b: Annotated[Path | None, tyro.conf.arg(metavar="FILE.tum")] = None
+    """The same for the log of the map after."""
+    poses: tyro.conf.Suppress[Path | None] = None
     within: Annotated[float, tyro.conf.arg(metavar="M")] = 0.5
     """How far a thing may have moved, m; farther away it is another one."""
     alpha: Annotated[float, tyro.conf.arg(metavar="P")] = 0.01
@@ -59,6 +65,9 @@ class Compare(LogInput):
             raise UsageError(f"--alpha must be between 0 and 1, not {self.alpha}")
         if self.at_least < 1:
             raise UsageError(f"--at-least must be 1 or more, not {self.at_least}")
+        for which, log, poses in (("a", self.log_a, self.poses_a), ("b", self.log_b, self.poses_b)):
+            if poses is not None and log is None:
+                raise UsageError(f"--poses-{which} is for --log-{which}, which is not given")
         check_input(self)
         a, b, settings = read_two_maps(self.a, self.b)
         from linemap_jax.build import CHUNK
@@ -68,10 +77,15 @@ class Compare(LogInput):
         alike = agreement(a, b)
         warn_of_frames(self.a, self.b, alike, quiet=self.quiet)
         found = compare_maps(a, b, **options)
-        logs: list[tuple[What, Path | None]] = [("appeared", self.log_a), ("vanished", self.log_b)]
-        for (what, path), map_file, line_map, of_map in zip(logs, (self.a, self.b), (a, b), settings, strict=True):
+        logs: list[tuple[What, Path | None, Path | None]] = [
+            ("appeared", self.log_a, self.poses_a),
+            ("vanished", self.log_b, self.poses_b),
+        ]
+        maps = zip((self.a, self.b), (a, b), settings, strict=True)
+        for (what, path, poses), (map_file, line_map, of_map) in zip(logs, maps, strict=True):
             if path is not None:
-                command = at_poses_of_map(self, path, map_file, of_map, quiet=self.quiet)
+                command = dataclasses.replace(self, poses=poses)
+                command = at_poses_of_map(command, path, map_file, of_map, quiet=self.quiet)
                 log = opened(command, path)
                 mount = mount_of(command, log, quiet=self.quiet)
                 fit = Fit(line_map, mount)

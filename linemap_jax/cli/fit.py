@@ -47,7 +47,8 @@ def at_poses_of_map(
     trajectory = map_in(map_file).with_name("trajectory.tum")
     if not trajectory.exists():
         raise UsageError(
-            f"{map_file} was built by `linemap slam`, so not at the poses of {log}: give its trajectory by --poses"
+            f"{map_file} was built by `linemap slam`, so not at the poses of {log}: give its trajectory by --poses "
+            "(of `compare`: --poses-a, --poses-b)"
         )
     say(f"{map_file} was built by `linemap slam`: the poses are those of {trajectory}", quiet=quiet)
     offset = command.laser_offset

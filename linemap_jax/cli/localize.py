@@ -5,6 +5,7 @@ import json
 import math
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -62,12 +63,14 @@ class Localize(LogOptions):
         files = [tum, beside, *([picture] if in_folder else [])]
         check_output(tum.parent, *files, overwrite=self.overwrite)
         try:
-            line_map, _ = read_map(self.map, dtype=self.dtype)
+            line_map, of_map = read_map(self.map, dtype=self.dtype)
         except MapFileError as error:
             swapped = map_in(self.log)
             if self.map.exists() and swapped.exists() and swapped.suffix in (".json", ".geojson"):
                 raise UsageError(f"{error}; the map comes first, then the log") from error
             raise
+        if not _tells_sides(of_map):
+            options["rules"] = dataclasses.replace(options["rules"], tell_sides=False)
         if not line_map.lines.valid.any():
             raise UsageError(f"{self.map} holds no line: there is nothing to find the robot by")
         log = opened(self, self.log)
@@ -118,6 +121,14 @@ def _check(command: Localize) -> None:
         raise UsageError(f"--start-sigma must be zero or positive, not {command.start_sigma}")
     if not 0 < command.odometry_noise < math.inf:
         raise UsageError(f"--odometry-noise must be positive, not {command.odometry_noise}")
+
+
+def _tells_sides(settings: Mapping[str, Any]) -> bool:
+    """Whether a map says from where its lines were seen. What this package builds does, a drawing not."""
+    merged, rules = settings.get("merged"), settings.get("rules")
+    if isinstance(merged, list):
+        return all(isinstance(each, Mapping) and _tells_sides(each) for each in merged)
+    return isinstance(rules, Mapping) and rules.get("tell_sides") is True
 
 
 def _way_through(command: Localize, log: "Log", line_map: "LineMap", options: dict[str, Any]) -> Way:

@@ -406,7 +406,8 @@ def passed_circles(
     """Which circles of the map the beams of a scan prove to be gone.
 
     A circle is gone if every beam through the window in which it may stand, at least two of them, ends beyond it; and
-    if it is wide enough for no two beams to pass it by on either side.
+    if no two of them, nor the last of them and the edge of that window, are so far apart that it may stand between: a
+    pole at the rim of what the scanner sees, or among beams without a return, stays.
 
     Args:
       circles: the `C` circles of the map.
@@ -418,6 +419,10 @@ def passed_circles(
     Returns:
       Which of them are gone. Shape `[C]`.
     """
+    # Points run counter-clockwise, from the right to the left of what stands before them; the first follows the last.
+    n = jnp.sum(swath.points.valid, dtype=jnp.int32)
+    index = jnp.arange(swath.points.valid.shape[0], dtype=jnp.int32)
+    following = jnp.where(index + 1 < n, index + 1, 0)
 
     def gone(center: Array, radius: Array) -> Array:
         from_robot = center - swath.robot
@@ -432,11 +437,13 @@ def passed_circles(
         lateral = jnp.sqrt(spread(perp(ahead)) + (distance * noise.bearing_sigma) ** 2)
         depth = jnp.sqrt(spread(ahead) + noise.range_sigma**2)
         along = dot(swath.points.beam, to_center[None])
-        window = jnp.abs(_cross(swath.points.beam, to_center[None])) < radius + thresholds.wipe_sigmas * lateral
-        witness = swath.points.valid & window & (along > 0)
+        aside, unsure = _cross(swath.points.beam, to_center[None]), thresholds.wipe_sigmas * lateral
+        witness = swath.points.valid & (jnp.abs(aside) < radius + unsure) & (along > 0)
         beyond = swath.points.range > along + radius + thresholds.wipe_sigmas * depth
-        enough = jnp.sum(witness) >= 2
-        return enough & jnp.all(beyond | ~witness) & (2 * radius >= swath.points.spacing * distance)
+        wide = witness & witness[following] & (aside - aside[following] > 2 * radius)
+        first, last = jnp.min(jnp.where(witness, aside, jnp.inf)), jnp.max(jnp.where(witness, aside, -jnp.inf))
+        covered = ~jnp.any(wide) & (first <= radius - unsure) & (last >= unsure - radius)
+        return (jnp.sum(witness) >= 2) & jnp.all(beyond | ~witness) & covered
 
     return circles.valid & jax.vmap(gone)(circles.center, circles.radius)
 

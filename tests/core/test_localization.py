@@ -1,6 +1,7 @@
 """Localisation: its update against a joint Kalman filter in NumPy, its sightings against the truth."""
 
 import dataclasses
+from functools import partial
 from typing import Any
 
 import jax
@@ -229,7 +230,7 @@ def test_sightings_are_what_pose_and_map_err_by() -> None:
         return (
             sight_lines(seen, pose, cov, lines, Thresholds(), Rules(tell_sides=False), settings),
             sight_circles(seen, pose, cov, poles, 8, settings),
-            sight_points(seen, pose, seen.alone, lines, noise, settings),
+            sight_points(seen, pose, seen.alone, lines, noise, Rules(tell_sides=False), settings),
         )
 
     for off, e in (([0.0, 0.0, 0.0], [0.3, -0.4]), ([0.004, -0.006, 0.003], [0.0, 0.0])):
@@ -240,6 +241,40 @@ def test_sightings_are_what_pose_and_map_err_by() -> None:
             assert np.asarray(sightings.slot)[used].tolist() == slots
             expected = np.asarray(sightings.jac_pose)[used] @ off + np.asarray(sightings.by_map)[used] @ e
             np.testing.assert_allclose(np.asarray(sightings.innovation)[used], expected, atol=1e-4)
+
+
+def test_a_wall_is_known_by_the_side_on_which_the_robot_is() -> None:
+    """Lines and points are held against what has been seen from their side, in a map that tells."""
+    truth = np.array([3.0, 2.2, 0.4])
+    seen, lines = seen_in_room(truth), ROOM.lines
+    cov, noise, settings = jnp.diag(jnp.array([0.02, 0.02, 0.01]) ** 2), SensorNoise(), LocalizationSettings()
+    away = jnp.sum((lines.anchor - truth[None, :2]) * lines.normal, -1) + lines.offset > 0
+
+    @partial(jax.jit, static_argnames="rules")
+    def sight(turned: Any, rules: Rules) -> Any:
+        faced = dataclasses.replace(
+            lines,
+            angle=lines.angle + jnp.where(turned, jnp.pi, 0),
+            offset=jnp.where(turned, -lines.offset, lines.offset),
+            extent=jnp.where(turned[:, None], -lines.extent[:, ::-1], lines.extent),
+        )
+        pose = jnp.asarray(truth)
+        return (
+            sight_lines(seen, pose, cov, faced, Thresholds(), rules, settings),
+            sight_points(seen, pose, seen.alone, faced, noise, rules, settings),
+        )
+
+    def slots(sightings: Any) -> list[int]:
+        return np.asarray(sightings.slot)[np.asarray(sightings.valid)].tolist()
+
+    # The second wall runs as if it were seen from outside.
+    for turned, rules, of_lines, of_points in (
+        (~away, Rules(tell_sides=False), [0, 1], [0]),
+        (~away, Rules(), [0], [0]),
+        (away, Rules(), [1], []),
+    ):
+        lines_seen, points_seen = sight(turned, rules)
+        assert (slots(lines_seen), slots(points_seen)) == (of_lines, of_points)
 
 
 def test_the_field_of_a_map_has_cells_of_at_most_ten_centimetres() -> None:

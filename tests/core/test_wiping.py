@@ -353,6 +353,35 @@ def test_circles_that_beams_passed(x: float, radius: float, gone: bool) -> None:
     assert bool(passed_circles(circles, swath, HERE.cov, Thresholds(), SensorNoise())[0]) == gone
 
 
+def test_a_circle_stays_where_it_may_stand_between_beams_or_beside_them() -> None:
+    """Not gone while it can hide: at the rim of the view, or where beams came back with nothing."""
+    pole = circle_at(2.0, 0.0, 0.1)
+    # Of 1 cm, 2 mrad and 3 sigma the window is 3.7 cm wider than the pole on either side.
+    for low, high, without, gone in (
+        (-45, 46, (), True),
+        (1, 46, (), True),
+        (2, 46, (), False),  # may be to the right of the first beam
+        (-45, -1, (), False),
+        (-45, 46, (0, 1, 2), True),  # 14 cm between the beams beside: less than its width
+        (-45, 46, (-2, -1, 0, 1, 2), False),
+    ):
+        degrees = np.arange(low, high)
+        ranges = np.where(np.isin(degrees, without), np.nan, 3 / np.cos(np.radians(degrees)))
+        for turn in (slice(None), slice(None, None, -1)):
+            scan = Scan.from_ranges(ranges[turn], np.radians(degrees)[turn])
+            points = points_from_scan(scan, HERE, Mount(), jacobians="analytic")
+            n, none = len(degrees), jnp.array([-1])
+            swath = swath_jit(points, HERE, jnp.full(n, -1), lines_of(capacity=1), none, none, Thresholds())
+            found = passed_circles(pole, swath, HERE.cov, Thresholds(), SensorNoise())
+            assert bool(found[0]) == gone, (low, high, without)
+    # Behind the robot, where the sweep of a scanner all around begins and ends.
+    bearings = np.radians(np.arange(-180, 180))
+    points = points_from_scan(Scan.from_ranges(np.full(360, 3.0), bearings), HERE, Mount(), jacobians="analytic")
+    swath = swath_jit(points, HERE, jnp.full(360, -1), lines_of(capacity=1), none, none, Thresholds())
+    behind = circle_at(-2.0, 0.0, 0.1)
+    assert bool(passed_circles(behind, swath, HERE.cov, Thresholds(), SensorNoise())[0])
+
+
 def test_a_beam_passed_if_it_ended_beyond_the_line_by_the_spread_of_that() -> None:
     """The spread is that of where the point would lie across the line if the beam had ended on it.
 

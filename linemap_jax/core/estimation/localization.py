@@ -47,7 +47,7 @@ from linemap_jax.core.frames import (
     wrap_angle,
 )
 from linemap_jax.core.matching import compare_lines, compare_pieces, match_lines
-from linemap_jax.core.propagation import inverse, product, propagate, quadratic, square_root, symmetric
+from linemap_jax.core.propagation import apply, inverse, product, propagate, quadratic, square_root, symmetric
 from linemap_jax.core.sensor import point_from_measurement
 from linemap_jax.core.settings import SCAN_CAPACITY, Capacity, Method, Mount, Number, Rules, SensorNoise, Thresholds
 from linemap_jax.core.slots import all_true, choose, directed, least, take
@@ -269,15 +269,15 @@ def localize(
       mount: of the scanner on the robot.
       settings: thresholds of the filter.
       capacity: slots for what one scan holds.
-      **method: as for `extract`.
+      **method: as for `extract`. With `Rules.tell_sides` a wall is known by the side on which the robot is: for a map
+        that somebody has drawn, and which does not tell, it must be off.
 
     Returns:
       The belief after the last scan, and what the filter says after each, stacked `[T]`.
     """
     odometry, thresholds, noise = odometry or OdometryNoise(), thresholds or Thresholds(), noise or SensorNoise()
     mount, settings = mount or Mount(), settings or LocalizationSettings()
-    # A map that somebody has drawn does not say from where its lines are seen.
-    rules = dataclasses.replace(method.get("rules", Rules()), tell_sides=False)
+    rules = method.get("rules", Rules())
     lines = directed(line_map.lines)
 
     def step(belief: Belief, x: tuple[Scan, Array, Array, Array]) -> tuple[Belief, Located]:
@@ -407,8 +407,10 @@ def locate(
     prior = dataclasses.replace(belief, cov_own=belief.cov_own + wrong * (cov + resolution))
     vague = jnp.any(jnp.diag(prior.cov) > jnp.diag(resolution))
     # What is matched is judged by what the search leaves open, or by the prediction where that is surer.
+    start = jnp.where(vague, found, belief.mean)
     judged_by = dataclasses.replace(
         prior,
+        mean=start,
         cov_own=jnp.where(vague, resolution, prior.cov_own),
         by_map=jnp.where(vague, 0, prior.by_map),
     )
@@ -419,15 +421,16 @@ def locate(
         by_lines = sight_lines(seen, at, spread, lines, thresholds, rules, settings)
         by_circles = sight_circles(seen, at, spread, line_map.circles, lines.valid.shape[0], settings)
         by_points = jax.lax.cond(i > 0, points_from, lambda _: no_points, at)
-        sightings = gated(judged_by, _packed([by_lines, by_circles, by_points]), settings.match_nis)
+        sightings = gated(judged_by, at, _packed([by_lines, by_circles, by_points]), settings.match_nis)
+        # Nor may a thing pull the pose away from where it can be: a pole that was moved fits, once it has.
+        sightings = gated(prior, at, sightings, settings.match_nis)
         after, nis = update(prior, at, sightings)
         return after.mean, after, sightings, nis
 
     def points_from(at: Float[Array, "3"]) -> Sightings:
-        return sight_points(seen, at, seen.alone, lines, noise, settings)
+        return sight_points(seen, at, seen.alone, lines, noise, rules, settings)
 
     no_points = _no_sightings(min(GROUPS, lines.valid.shape[0]), dtype)
-    start = jnp.where(vague, found, belief.mean)
     carry = (start, judged_by, _no_sightings(SIGHTINGS, dtype), jnp.zeros((), dtype))
     _, after, sightings, nis = jax.lax.fori_loop(0, ITERATIONS, look, carry)
 
@@ -613,6 +616,7 @@ def sight_points(
     which: Bool[Array, " N"],
     model: Lines,
     noise: SensorNoise,
+    rules: Rules,
     settings: LocalizationSettings,
 ) -> Sightings:
     """Points in no line, each held against the nearest segment of the map; those at one segment make one sighting.
@@ -626,6 +630,7 @@ def sight_points(
       which: the points that take part. Shape `[N]`.
       model: the lines of the map.
       noise: of the sensor.
+      rules: `tell_sides`.
       settings: `point_distance` and the floors.
 
     Returns:
@@ -634,7 +639,9 @@ def sight_points(
     towards = rotate(pose[2], seen.beams)
     points = pose[None, :2] + rotate(pose[2], seen.points)
     across, along, beside = _beside(points, model)
-    slot, _ = least(jnp.where(model.valid[None], across**2 + beside**2, jnp.inf))
+    faces = dot(towards[:, None], model.normal[None]) > 0
+    seen_from = model.valid[None] & (faces | (not rules.tell_sides))
+    slot, _ = least(jnp.where(seen_from, across**2 + beside**2, jnp.inf))
     across, along, beside = (jnp.take_along_axis(x, slot[:, None], 1)[:, 0] for x in (across, along, beside))
     cosine = dot(model.normal[slot], towards)
     variance = (noise.range_sigma * cosine) ** 2 + (noise.bearing_sigma * seen.ranges) ** 2 * (1 - cosine**2)
@@ -700,18 +707,20 @@ def innovation_cov(belief: Belief, sightings: Sightings) -> Float[Array, "S 2 2"
     return of_pose + common + jnp.swapaxes(common, -1, -2) + squared(sightings.by_map) + sightings.cov
 
 
-def gated(belief: Belief, sightings: Sightings, most: Number) -> Sightings:
-    """The sightings whose normalised innovation squared is less than `most`.
+def gated(belief: Belief, at: Float[Array, "3"], sightings: Sightings, most: Number) -> Sightings:
+    """The sightings whose normalised innovation squared, by a belief, is less than `most`.
 
     Args:
-      belief: predicted.
+      belief: that judges.
+      at: the pose at which the sightings are linearised.
       sightings: `S` of them.
       most: the gate, a quantile of chi-square with 2 degrees of freedom.
 
     Returns:
       The sightings; those beyond the gate are not valid.
     """
-    nis = quadratic(sightings.innovation, inverse(innovation_cov(belief, sightings)))
+    innovation = sightings.innovation - apply(sightings.jac_pose, _minus(at, belief.mean)[None])
+    nis = quadratic(innovation, inverse(innovation_cov(belief, sightings)))
     return _where(
         sightings.valid & (nis < most),
         slot=sightings.slot,
