@@ -113,7 +113,7 @@ def accuracy(runs: int) -> str:
     """Lines of the optimal segmentation beside other fits of their points."""
     cells = {name: cell for name, cell in consistency.cells().items() if "exact pose" in name}
     ratios = []
-    for name, cell in tqdm(cells.items(), desc="accuracy", disable=None):
+    for name, cell in tqdm(cells.items(), desc="accuracy", mininterval=5):
         errors, counts = run(errors_of_fits, name, cell, runs)
         rms = np.sqrt(np.mean(np.square(errors[counts]), 0))
         ratios.append(rms / rms[1])
@@ -132,7 +132,7 @@ def table_of_scans(
     """A table of samples, by what they are called; what should hold and does not is told on stderr."""
     cells = dict(itertools.islice(consistency.cells().items(), 0, None, every))
     verdicts: dict[str, list[Verdict]] = {}
-    for name_of_cell, cell in tqdm(cells.items(), desc="single scans", disable=None):
+    for name_of_cell, cell in tqdm(cells.items(), desc="single scans", mininterval=5):
         for name, sample in run(experiment, name_of_cell, cell, runs).items():
             verdicts.setdefault(name, []).append(judge(sample))
     band = consistency.bands(runs, len(cells))
@@ -206,7 +206,7 @@ def fused_scans(runs: int) -> str:
         }
 
         experiment = partial(many_scans, correlation=correlation, models=tuple(models.values()))
-        results = [run(experiment, *c, runs) for c in tqdm(cells.items(), desc=f"a = {correlation}", disable=None)]
+        results = [run(experiment, *c, runs) for c in tqdm(cells.items(), desc=f"a = {correlation}", mininterval=5)]
         for i, name in enumerate(models):
             verdicts = [[judge(_of(samples, i, k - 1)) for k in AFTER] for samples, _ in results]
             nis = [x[:, i][x[:, i] > 0] for _, x in results]
@@ -287,7 +287,7 @@ def poles(runs: int) -> str:
         for name, experiment in (("known", consistency_of_circles.known_points), ("pipeline", pipeline))
     }
     verdicts: dict[str, list[Verdict]] = {"fit": [], "arc": [], "pipeline": []}
-    for name, cell in tqdm(cells.items(), desc="poles", disable=None):
+    for name, cell in tqdm(cells.items(), desc="poles", mininterval=5):
         for what, experiment in experiments.items():
             found = run(experiment, name, cell, runs)
             for kind, sample in found.items() if what == "known" else [("pipeline", found)]:

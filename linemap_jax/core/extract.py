@@ -160,8 +160,10 @@ def usable(scan: Scan, pose: Pose) -> tuple[Scan, Pose, Bool[Array, ""]]:
       The scan, the pose, and whether the pose was finite.
 
     Raises:
-      ValueError: at trace time, for a pose of another shape.
+      ValueError: at trace time, for a pose of another shape, or for several scans.
     """
+    if scan.ranges.ndim != 1:
+        raise ValueError(f"one scan has ranges [N], not {list(scan.ranges.shape)}: jax.vmap or jax.lax.map takes many")
     for name, shape in (("mean", (3,)), ("cov", (3, 3))):
         if getattr(pose, name).shape != shape:
             raise ValueError(f"pose.{name} must have shape {shape}, not {getattr(pose, name).shape}")

@@ -82,8 +82,10 @@ def run_chunks(
       LostProcess: if another process has ended or failed. Where it was the first one, jax itself ends this one.
     """
     sizes = {np.shape(leaf)[0] if np.ndim(leaf) else 0 for leaf in jax.tree.leaves(runs)}
-    if len(sizes) != 1 or sizes == {0}:
-        raise ValueError(f"all leaves of the runs need one leading axis of the same size, not {sorted(sizes)}")
+    if sizes == {0}:
+        raise ValueError("there is no run: the runs need a leading axis, of at least one")
+    if len(sizes) != 1:
+        raise ValueError(f"all leaves of the runs need a leading axis of the same size, not {sorted(sizes)}")
     count = sizes.pop()
     mesh = mesh or mesh_of_devices(1)
     size = mesh.size * batch * batches

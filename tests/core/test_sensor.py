@@ -231,6 +231,16 @@ def test_a_pose_of_another_shape_is_refused(mean: Any, cov: Any, told: str) -> N
         usable(room(), pose)
 
 
+def test_several_scans_are_refused_where_one_is_asked_for() -> None:
+    scans = object.__new__(Scan)
+    for name, x in vars(room()).items():
+        object.__setattr__(scans, name, jnp.stack([x, x]))
+    with pytest.raises(
+        ValueError, match=r"one scan has ranges \[N\], not \[2, 61\]: jax.vmap or jax.lax.map takes many"
+    ):
+        usable(scans, ORIGIN)
+
+
 def test_an_empty_scan_changes_no_map() -> None:
     line_map, _ = update(empty_map(MAP), room(), ORIGIN, capacity=CAPACITY)
     nothing = dataclasses.replace(room(), valid=jnp.zeros(61, bool))
