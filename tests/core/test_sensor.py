@@ -235,9 +235,7 @@ def test_several_scans_are_refused_where_one_is_asked_for() -> None:
     scans = object.__new__(Scan)
     for name, x in vars(room()).items():
         object.__setattr__(scans, name, jnp.stack([x, x]))
-    with pytest.raises(
-        ValueError, match=r"one scan has ranges \[N\], not \[2, 61\]: jax.vmap or jax.lax.map takes many"
-    ):
+    with pytest.raises(ValueError, match=r"one scan has ranges \[N\], not \[2, 61\]: jax.vmap or"):
         usable(scans, ORIGIN)
 
 
