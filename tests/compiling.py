@@ -5,9 +5,11 @@ from typing import Any
 
 import jax
 
+from linemap_jax.build import COMPILER_OPTIONS
+
 AS_USERS: Any = {"xla_backend_optimization_level": 3, "xla_cpu_use_fusion_emitters": True}
 """As jax does it unless told otherwise."""
-AS_BUILD: Any = AS_USERS | {"xla_cpu_use_fusion_emitters": False}
+AS_BUILD: Any = AS_USERS | COMPILER_OPTIONS
 """As `linemap_jax.build` does it."""
 
 A_LITTLE: Any = AS_BUILD | {"xla_backend_optimization_level": 1}

@@ -16,6 +16,7 @@ import pytest
 from compiling import AS_USERS
 
 from linemap_jax import Pose, Scan, SensorNoise, Thresholds, extract, preset
+from linemap_jax.build import COMPILER_OPTIONS
 from linemap_jax.core import circles, slots
 from linemap_jax.core.extract import as_dtype
 from linemap_jax.core.runs import Runs
@@ -92,6 +93,16 @@ def test_sums_over_runs_are_a_scatter_and_no_loop(dtype: str) -> None:
     text = jax.jit(function, compiler_options=AS_USERS).lower(given).compile().as_text()
     assert " scatter(" in text
     assert loops(text) == (0, 0)
+
+
+def test_a_map_step_is_compiled_without_reductions_in_pieces() -> None:
+    """Which XLA makes of the least of many slots unless told not to; each would be kernels of its own."""
+    scores = jnp.zeros((32, 512), "float32")
+    texts = [
+        jax.jit(slots.least, compiler_options=options).lower(scores).compile().as_text()
+        for options in (AS_USERS, AS_USERS | COMPILER_OPTIONS)
+    ]
+    assert [" reduce-window(" in text for text in texts] == [True, False]
 
 
 def test_a_loop_that_is_too_large_is_told_from_one_that_is_not() -> None:
