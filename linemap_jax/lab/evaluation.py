@@ -121,7 +121,7 @@ def _distance(line_map: LineMap, point: Float[Array, "2"], robot: Float[Array, "
 def duplicates(
     lines: Lines, *, within: float | Array = 0.1, angle: float | Array = 0.087, overlap: float | Array = 0.5
 ) -> Bool[Array, " K"]:
-    """Lines that the map holds once more: a longer one runs along them.
+    """Lines that the map holds once more: a longer one runs along them, seen from the same side.
 
     Args:
       lines: `K` lines of a map.
@@ -140,7 +140,7 @@ def duplicates(
         across = jnp.abs(dot(ends, normal[j][None]) - lines.offset[j])
         along = dot(ends, tangent[j][None])
         shared = jnp.minimum(jnp.max(along), lines.extent[j, 1]) - jnp.maximum(jnp.min(along), lines.extent[j, 0])
-        parallel = jnp.abs(dot(tangent[i], normal[j])) < jnp.sin(angle)
+        parallel = dot(tangent[i], tangent[j]) > jnp.cos(angle)
         shorter = (length[i] < length[j]) | ((length[i] == length[j]) & (i > j))
         near = jnp.all(across < within) & parallel & (shared > overlap * length[i])
         return lines.valid[i] & lines.valid[j] & shorter & near

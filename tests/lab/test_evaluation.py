@@ -114,7 +114,7 @@ def test_duplicates_are_the_shorter_ones_of_two() -> None:
         lines = dataclasses.replace(
             lines,
             anchor=lines.anchor.at[slot].set(jnp.array([8.0 + off, 0.0])),
-            angle=lines.angle.at[slot].set(np.pi + turn),
+            angle=lines.angle.at[slot].set(turn),
             extent=lines.extent.at[slot].set(jnp.array([begin, end])),
             valid=lines.valid.at[slot].set(True),
         )
@@ -125,3 +125,5 @@ def test_duplicates_are_the_shorter_ones_of_two() -> None:
     np.testing.assert_array_equal(duplicates(lines), [True, False, False, False])
     beside(2, 0.08, -6.0, -3.5)  # for the most part behind the end
     np.testing.assert_array_equal(duplicates(lines), [True, False, False, False])
+    beside(0, 0.08, -1.0, 2.0, turn=np.pi)  # the other face
+    np.testing.assert_array_equal(duplicates(lines), [False, False, False, False])
