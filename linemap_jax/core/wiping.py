@@ -20,7 +20,7 @@ from linemap_jax.core.matching import normal_variance
 from linemap_jax.core.propagation import quadratic
 from linemap_jax.core.sensor import Points
 from linemap_jax.core.settings import Number, Rules, SensorNoise, Thresholds
-from linemap_jax.core.slots import all_true, first_true, put, rank_of_true, take
+from linemap_jax.core.slots import all_true, computed_once, first_true, put, rank_of_true, take
 from linemap_jax.core.state import Circles, Lines, Pose, pytree
 
 NEAR_PARALLEL = 1e-6
@@ -423,8 +423,11 @@ def passed_circles(
     n = jnp.sum(swath.points.valid, dtype=jnp.int32)
     index = jnp.arange(swath.points.valid.shape[0], dtype=jnp.int32)
     following = jnp.where(index + 1 < n, index + 1, 0)
+    beams, next_beams = swath.points.beam, swath.points.beam[following]
+    follows = swath.points.valid[following]
 
-    def gone(center: Array, radius: Array) -> Array:
+    def window(center: Array) -> tuple[Array, Array, Array]:
+        """Where a circle is seen, and what its place errs by aside and in depth."""
         from_robot = center - swath.robot
         to_center = from_robot - swath.points.laser
         distance = jnp.sqrt(dot(to_center, to_center))
@@ -436,16 +439,21 @@ def passed_circles(
 
         lateral = jnp.sqrt(spread(perp(ahead)) + (distance * noise.bearing_sigma) ** 2)
         depth = jnp.sqrt(spread(ahead) + noise.range_sigma**2)
-        along = dot(swath.points.beam, to_center[None])
-        aside, unsure = _cross(swath.points.beam, to_center[None]), thresholds.wipe_sigmas * lateral
-        witness = swath.points.valid & (jnp.abs(aside) < radius + unsure) & (along > 0)
-        beyond = swath.points.range > along + radius + thresholds.wipe_sigmas * depth
-        wide = witness & witness[following] & (aside - aside[following] > 2 * radius)
-        first, last = jnp.min(jnp.where(witness, aside, jnp.inf)), jnp.max(jnp.where(witness, aside, -jnp.inf))
-        covered = ~jnp.any(wide) & (first <= radius - unsure) & (last >= unsure - radius)
-        return (jnp.sum(witness) >= 2) & jnp.all(beyond | ~witness) & covered
+        return to_center, thresholds.wipe_sigmas * lateral, thresholds.wipe_sigmas * depth
 
-    return circles.valid & jax.vmap(gone)(circles.center, circles.radius)
+    def gone(to_center: Array, unsure: Array, deep: Array, radius: Array) -> Array:
+        along, next_along = dot(beams, to_center[None]), dot(next_beams, to_center[None])
+        aside, next_aside = _cross(beams, to_center[None]), _cross(next_beams, to_center[None])
+        witness = swath.points.valid & (jnp.abs(aside) < radius + unsure) & (along > 0)
+        next_too = follows & (jnp.abs(next_aside) < radius + unsure) & (next_along > 0)
+        beyond = swath.points.range > along + radius + deep
+        wide = witness & next_too & (aside - next_aside > 2 * radius)
+        to_left, to_right = witness & (aside <= radius - unsure), witness & (aside >= unsure - radius)
+        covered = jnp.any(to_left) & jnp.any(to_right) & (jnp.sum(witness) >= 2)
+        return covered & ~jnp.any(wide | (witness & ~beyond))
+
+    windows = computed_once(jax.vmap(window), circles.center)
+    return circles.valid & jax.vmap(gone)(*windows, circles.radius)
 
 
 def circles_inside_triangles(circles: Circles, triangles: Triangles) -> Bool[Array, " C"]:
