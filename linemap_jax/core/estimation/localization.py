@@ -47,7 +47,7 @@ from linemap_jax.core.frames import (
     wrap_angle,
 )
 from linemap_jax.core.matching import compare_lines, compare_pieces, match_lines
-from linemap_jax.core.propagation import apply, inverse, product, propagate, quadratic, square_root, symmetric
+from linemap_jax.core.propagation import inverse, product, propagate, quadratic, square_root, symmetric
 from linemap_jax.core.sensor import point_from_measurement
 from linemap_jax.core.settings import SCAN_CAPACITY, Capacity, Method, Mount, Number, Rules, SensorNoise, Thresholds
 from linemap_jax.core.slots import all_true, choose, directed, least, take
@@ -719,7 +719,7 @@ def gated(belief: Belief, at: Float[Array, "3"], sightings: Sightings, most: Num
     Returns:
       The sightings; those beyond the gate are not valid.
     """
-    innovation = sightings.innovation - apply(sightings.jac_pose, _minus(at, belief.mean)[None])
+    innovation = sightings.innovation - jnp.sum(sightings.jac_pose * _minus(at, belief.mean)[None, None], -1)
     nis = quadratic(innovation, inverse(innovation_cov(belief, sightings)))
     return _where(
         sightings.valid & (nis < most),
