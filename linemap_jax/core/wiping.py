@@ -452,8 +452,8 @@ def passed_circles(
         covered = jnp.any(to_left) & jnp.any(to_right) & (jnp.sum(witness) >= 2)
         return covered & ~jnp.any(wide | (witness & ~beyond))
 
-    windows = computed_once(jax.vmap(window), circles.center)
-    return circles.valid & jax.vmap(gone)(*windows, circles.radius)
+    to_center, unsure, deep = computed_once(jax.vmap(window), circles.center)
+    return circles.valid & jax.vmap(gone)(to_center, unsure, deep, circles.radius)
 
 
 def circles_inside_triangles(circles: Circles, triangles: Triangles) -> Bool[Array, " C"]:
