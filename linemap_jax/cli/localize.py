@@ -13,7 +13,7 @@ import tyro
 
 from linemap_jax.cli.compilations import cache_folder
 from linemap_jax.cli.logs import chunks_of_log, mount_of_odometry, odometry_of, opened, progress, warn
-from linemap_jax.cli.options import LogOptions, UsageError, options_of_update
+from linemap_jax.cli.options import POSE_SIGMA, LogOptions, UsageError, options_of_update
 from linemap_jax.cli.output import check_output, make_folder, say
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ class Localize(LogOptions):
     """How much worse the wheels count than is usual indoors; a factor of all their standard deviations."""
     json: bool = False
     """Print the summary as JSON."""
-    pose_sigma: tyro.conf.Suppress[tuple[float, float, float]] = (0.05, 0.05, 0.01)
+    pose_sigma: tyro.conf.Suppress[tuple[float, float, float]] = POSE_SIGMA  # of no effect here
 
     def run(self) -> int:
         """Localise, and give the exit status."""

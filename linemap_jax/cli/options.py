@@ -26,6 +26,10 @@ class UsageError(Exception):
     """What is wrong with the command, in one sentence."""
 
 
+POSE_SIGMA = (0.05, 0.05, 0.01)
+"""Of poses for which nothing is stated, m m rad."""
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LogInput:
     """Options of all commands that read a log: what to take from it."""
@@ -67,7 +71,7 @@ class LogOptions(LogInput):
     """Standard deviation of a range, m. That of the scanner, or 0.02, unless given."""
     bearing_sigma: Annotated[float | None, tyro.conf.arg(metavar="RAD")] = None
     """Standard deviation of a bearing, rad. That of the scanner, or 0.001, unless given."""
-    pose_sigma: Annotated[tuple[float, float, float], tyro.conf.arg(metavar="X Y THETA")] = (0.05, 0.05, 0.01)
+    pose_sigma: Annotated[tuple[float, float, float], tyro.conf.arg(metavar="X Y THETA")] = POSE_SIGMA
     """Standard deviations of every pose for which the log states no covariance, m m rad."""
     covariance: Literal["exact", "printed"] | None = None
     """`exact` to first order, or eq. 12 as `printed`. That of the preset unless given."""

@@ -13,7 +13,7 @@ import tyro
 
 from linemap_jax.cli.logs import SCANS_EXPLAINED, chunks_of_log, mount_of_odometry, odometry_of, opened, progress, warn
 from linemap_jax.cli.mapping import map_of_pieces
-from linemap_jax.cli.options import LogOptions, UsageError, options_of_update
+from linemap_jax.cli.options import POSE_SIGMA, LogOptions, UsageError, options_of_update
 from linemap_jax.cli.output import check_output, make_folder, say
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ class Slam(LogOptions):
     """Whose poses trajectory.tum and .csv hold: the laser's, or the robot's."""
     json: bool = False
     """Print the summary as JSON."""
-    pose_sigma: tyro.conf.Suppress[tuple[float, float, float]] = (0.05, 0.05, 0.01)
+    pose_sigma: tyro.conf.Suppress[tuple[float, float, float]] = POSE_SIGMA  # of no effect here
 
     def run(self) -> int:
         """Track, close loops, map, adjust; and give the exit status."""
