@@ -691,10 +691,12 @@ def likeliest_line(
     return (offset + change[0], float(wrap(angle + change[1]))), gain[:, :, None] * normal
 
 
-def _line_of_run(sweep: Sweep, run: list[int], kept: list[int], *, covariance: str, rules: Any) -> dict[str, Any]:
+def _line_of_run(
+    sweep: Sweep, run: list[int], kept: list[int], *, covariance: str, rules: Any, margin: Margin
+) -> dict[str, Any]:
     """The fields of one line from its points: estimate, end points, covariance; s4.2.3-4.2.5.
 
-    The ends are those of the run, the rest comes from the points that are kept.
+    The ends are those of the run if they lie on the line, and the rest comes from the points that are kept.
     """
     first, last = sweep.o[run[0]], sweep.o[run[-1]]
     o, r, u = sweep.o[kept], sweep.r[kept], sweep.u[kept]
@@ -711,7 +713,13 @@ def _line_of_run(sweep: Sweep, run: list[int], kept: list[int], *, covariance: s
         j = jac_line_points(o, here, last - first)
     normal = np.array([math.cos(angle), math.sin(angle)])
     tangent = np.array([-normal[1], normal[0]])
-    extent = np.array([tangent @ (first - here), tangent @ (last - here)])
+    ends = []
+    for of_run, of_fit in ((run[0], kept[0]), (run[-1], kept[-1])):
+        cos2 = float(normal @ sweep.u[of_run]) ** 2
+        sigma = math.sqrt(sweep.sr**2 * cos2 + (sweep.r[of_run] * sweep.sa) ** 2 * (1 - cos2))
+        beside = abs(float(normal @ (sweep.o[of_run] - here)) - offset)
+        ends.append(of_fit if margin.below(UNSURE_SIGMAS * sigma, beside) else of_run)
+    extent = np.array([tangent @ (sweep.o[k] - here) for k in ends])
 
     f, g = jac_point_pose(o), jac_point_measurement(r, u)
     c_s = np.diag([sweep.sr**2, sweep.sa**2])
@@ -725,7 +733,7 @@ def _line_of_run(sweep: Sweep, run: list[int], kept: list[int], *, covariance: s
         jac_line_pose = (j @ f).sum(0)
 
     var_extent = np.zeros(2)
-    for side, k in ((0, run[0]), (1, run[-1])):
+    for side, k in enumerate(ends):
         cov = sandwich(jac_point_pose(sweep.o[k]), sweep.cov_pose)
         cov = cov + sandwich(jac_point_measurement(sweep.r[k], sweep.u[k]), c_s)
         beam_on_line = sweep.spacing * sweep.r[k] / max(abs(normal @ sweep.u[k]), GRAZING)
@@ -993,7 +1001,7 @@ def extract(
     for run, points in zip(of_lines, kept_points, strict=True):
         if _are_enough(len(points), run):
             line_of_beam[sweep.beam[run]] = len(found)
-            found.append(_line_of_run(sweep, run, points, covariance=covariance, rules=rules))
+            found.append(_line_of_run(sweep, run, points, covariance=covariance, rules=rules, margin=margin))
         else:
             rejected["too_few"] += len(run)
     lines = Lines(
@@ -1738,9 +1746,11 @@ def _wiped_by_beams(circles: Circles, slot: int, sweep: Sweep, *, thresholds: An
     evidence = (np.abs(across) < width) & (along > 0)
     if evidence.sum() < 2 or not (sweep.r[evidence] > along[evidence] + depth).all():
         return False
+    # What a beam is off by itself: nearer to the rim than that it may have passed.
+    sure = radius - sigmas * rc * sweep.sa
     seen, shift = np.sort(across[evidence]), width - radius
     left = np.concatenate([[-np.inf], seen, [np.inf]])  # the free room between neighbouring beams
-    room = (left[:-1] + radius, left[1:] - radius)  # for centres
+    room = (left[:-1] + sure, left[1:] - sure)  # for centres
     return not bool(np.any((room[0] < room[1]) & (room[0] < shift) & (room[1] > -shift)))
 
 
@@ -1842,7 +1852,8 @@ def _update_circles(
     seen = lines.take([slot for slot in set(targets.tolist()) if slot >= 0 and lines.valid[slot]])
     for slot in np.flatnonzero(circles.valid).tolist():
         rim = circles.radius[slot] * circles.fitted[slot]
-        if (distance_to_segments(circles.center[slot], seen) < reach + rim).any():
+        counts = (seen.times_detected >= circles.times_detected[slot]) | (not rules.weigh_circles)
+        if (counts & (distance_to_segments(circles.center[slot], seen) < reach + rim)).any():
             _free(circles, slot)
             report.deleted += 1
 

@@ -21,7 +21,7 @@ from linemap_jax.core.frames import dot, perp
 from linemap_jax.core.propagation import apply, inverse, product, safe_sqrt, square_root, symmetric
 from linemap_jax.core.runs import Runs
 from linemap_jax.core.sensor import Points
-from linemap_jax.core.settings import Jacobians, SensorNoise, Thresholds
+from linemap_jax.core.settings import Jacobians, Rules, SensorNoise, Thresholds
 from linemap_jax.core.slots import bounded, directed, neutral_where_free
 from linemap_jax.core.state import Circles, Lines, Pose, squared
 
@@ -384,15 +384,18 @@ def _truncated(margin: Float[Array, " N"], sigma: Float[Array, " N"]) -> tuple[F
     return sigma * mills, 1 - mills * (t + mills)
 
 
-def near_lines(circles: Circles, lines: Lines, thresholds: Thresholds) -> Bool[Array, " C"]:
+def near_lines(circles: Circles, lines: Lines, thresholds: Thresholds, rules: Rules) -> Bool[Array, " C"]:
     """Section 4.3.1 (circles): which of them lie too close to a line to be modelled; they are probably its noise.
 
     A fitted circle is a body, and is held against the line with its rim: the bent end of a wall has a centre behind it.
+    With `rules.weigh_circles` only lines count that were detected as often as the circle. A departure: three returns of
+    a pole far away pass for a line, and that outweighs no pole that was seen a hundred times.
 
     Args:
       circles: `C` circles.
       lines: `K` lines.
       thresholds: `circle_line_distance`.
+      rules: `weigh_circles`.
 
     Returns:
       Which circles are too close; false for free slots. Shape `[C]`.
@@ -407,4 +410,7 @@ def near_lines(circles: Circles, lines: Lines, thresholds: Thresholds) -> Bool[A
 
     every = jax.vmap(jax.vmap(distance2, (None, 0)), (0, None))(circles.center, directed(lines))
     reach = thresholds.circle_line_distance + jnp.where(circles.fitted, circles.radius, 0)
-    return circles.valid & jnp.any(lines.valid[None] & (every < reach[:, None] ** 2), -1)
+    counts = lines.valid[None] & (every < reach[:, None] ** 2)
+    if rules.weigh_circles:
+        counts = counts & (lines.times_detected[None] >= circles.times_detected[:, None])
+    return circles.valid & jnp.any(counts, -1)

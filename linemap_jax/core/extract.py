@@ -250,7 +250,7 @@ def extract_points(
     circles = circles_.measure_circles(
         points, pose, clusters, thresholds, noise, fit=rules.fit_circles, jacobians=jacobians
     )
-    near = circles_.near_lines(circles, lines, thresholds)
+    near = circles_.near_lines(circles, lines, thresholds, rules)
     circles = dataclasses.replace(circles, valid=circles.valid & ~near)
 
     def points_of(count: Float[Array, " N"], ends: Bool[Array, " N"]) -> Int[Array, ""]:

@@ -264,7 +264,7 @@ def measure_lines(
     else:
         jac = jac_line_points(points.position, runs, anchor, jacobians=jacobians)
     offset, angle = line
-    extent = line_extent(points.position, runs, anchor, angle)
+    ends = _ends(points, runs, anchor, line, noise)
 
     sigma = jnp.stack([noise.range_sigma, noise.bearing_sigma])
     from_noise = product(jac, points.jac_measurement) * sigma[None, None]
@@ -285,8 +285,8 @@ def measure_lines(
         cov_independent=cov_measurement,
         sqrt_persistent=product(jac_line_pose, square_root(pose.cov)[None]),
         first_angle=angle,
-        extent=extent,
-        var_extent=_var_extent(points, pose, runs, angle, noise),
+        extent=line_extent(points.position, ends, anchor, angle),
+        var_extent=_var_extent(points, pose, ends, angle, noise),
         times_detected=jnp.ones_like(runs.first),
         valid=runs.valid,
     )
@@ -295,14 +295,33 @@ def measure_lines(
     return neutral_where_free(lines), jnp.where(measured, jac_line_pose, 0), jnp.where(measured, cov_measurement, 0)
 
 
+def _ends(
+    points: Points, runs: Runs, anchor: Float[Array, "K 2"], line: Float[Array, "2 K"], noise: SensorNoise
+) -> Int[Array, "K 2"]:
+    """Which points end each line: the first and last of its run, if they lie on the line, else the outermost of the fit.
+
+    Far away a run may go on round a corner. The points there are left out of the fit, and the last of them may lie
+    decimetres beside the line; what is on the line by `UNSURE_SIGMAS` may end it, fitted or not.
+    """
+    offset, angle = line
+    normal = jnp.stack([jnp.cos(angle), jnp.sin(angle)], -1)[:, None]
+    index = jnp.arange(runs.of_point.shape[0], dtype=jnp.int32)
+    mine = runs.of_point[None] == jnp.arange(runs.valid.shape[0])[:, None]
+    of_fit = [jnp.min(jnp.where(mine, index, index.shape[0] - 1), -1), jnp.max(jnp.where(mine, index, 0), -1)]
+    of_run = jnp.stack([runs.first, runs.last], -1)
+    across = dot(normal, points.position[of_run] - anchor[:, None]) - offset[:, None]
+    variance = _var_across(dot(normal, points.beam[of_run]) ** 2, points.range[of_run], noise)
+    return jnp.where(across**2 <= UNSURE_SIGMAS**2 * variance, of_run, jnp.stack(of_fit, -1))
+
+
 def line_extent(
-    position: Float[Array, "N 2"], runs: Runs, anchor: Float[Array, "K 2"], angle: Float[Array, " K"]
+    position: Float[Array, "N 2"], ends: Int[Array, "K 2"], anchor: Float[Array, "K 2"], angle: Float[Array, " K"]
 ) -> Float[Array, "K 2"]:
-    """Section 4.2.4: the first and the last point of each run, projected on its line; metres from the anchor.
+    """Section 4.2.4: the first and the last point of each line, projected on it; metres from the anchor.
 
     Args:
       position: the points, in metres. Shape `[N, 2]`.
-      runs: the lines that they belong to.
+      ends: which of them are the first and the last one of each line. Shape `[K, 2]`.
       anchor: of each line, in the coordinates of the points, m. Shape `[K, 2]`.
       angle: of each line's normal, rad. Shape `[K]`.
 
@@ -310,7 +329,7 @@ def line_extent(
       Begin and end along the tangent, m. Shape `[K, 2]`.
     """
     tangent = jnp.stack([-jnp.sin(angle), jnp.cos(angle)], -1)
-    return jnp.stack([dot(tangent, position[i] - anchor) for i in (runs.first, runs.last)], -1)
+    return dot(tangent[:, None], position[ends] - anchor[:, None])
 
 
 def choose_points(points: Points, runs: Runs, thresholds: Thresholds, noise: SensorNoise, rules: Rules) -> Runs:
@@ -424,7 +443,7 @@ def _strange_ends(
     return strange
 
 
-def _var_across(cosine2: Float[Array, " M"], range_: Float[Array, " M"], noise: SensorNoise) -> Float[Array, " M"]:
+def _var_across(cosine2: Float[Array, "*s"], range_: Float[Array, "*s"], noise: SensorNoise) -> Float[Array, "*s"]:
     """Variance of points across a line that their beams meet at an incidence of this squared cosine, m^2."""
     return noise.range_sigma**2 * cosine2 + (range_ * noise.bearing_sigma) ** 2 * (1 - cosine2)
 
@@ -450,23 +469,18 @@ def length_of_run(run: Run, position: Float[Array, "N 2"]) -> Float[Array, " N"]
 
 
 def _var_extent(
-    points: Points, pose: Pose, runs: Runs, angle: Float[Array, " K"], noise: SensorNoise
+    points: Points, pose: Pose, ends: Int[Array, "K 2"], angle: Float[Array, " K"], noise: SensorNoise
 ) -> Float[Array, "K 2"]:
     """Variance of the end points along the line, m^2.
 
     That of the outermost point, and that of a uniform distribution between it and the next beam, where the surface may
     have ended. Not in the paper, whose end points have no uncertainty.
     """
-    tangent = jnp.stack([-jnp.sin(angle), jnp.cos(angle)], -1)
-    normal = -perp(tangent)
-
-    def end(at: Int[Array, " K"]) -> Float[Array, " K"]:
-        cov = cov_point(points.jac_pose[at], points.jac_measurement[at], pose.cov, noise)
-        # A grazing beam says nothing about the end; 0.1 is 6 degrees.
-        step = points.spacing * points.range[at] / jnp.maximum(jnp.abs(dot(normal, points.beam[at])), 0.1)
-        return jnp.maximum(quadratic(tangent, cov), 0) + step**2 / 12  # rounding may leave less than nothing
-
-    return jnp.stack([end(runs.first), end(runs.last)], -1)
+    tangent = jnp.stack([-jnp.sin(angle), jnp.cos(angle)], -1)[:, None]
+    cov = cov_point(points.jac_pose[ends], points.jac_measurement[ends], pose.cov, noise)
+    # A grazing beam says nothing about the end; 0.1 is 6 degrees.
+    step = points.spacing * points.range[ends] / jnp.maximum(jnp.abs(dot(-perp(tangent), points.beam[ends])), 0.1)
+    return jnp.maximum(quadratic(tangent, cov), 0) + step**2 / 12  # rounding may leave less than nothing
 
 
 def rho_theta(lines: Lines) -> tuple[Float[Array, " K"], Float[Array, " K"], Float[Array, "K 2 2"]]:

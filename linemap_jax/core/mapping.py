@@ -424,7 +424,7 @@ def _update_circles(
     model = fusion.fuse_circles(model, new, match, rules, pose_error)
     model = dataclasses.replace(model, valid=model.valid & ~gone)
 
-    fresh = new.valid & (match.slot < 0) & ~match.ambiguous & ~near_lines(new, lines, thresholds)
+    fresh = new.valid & (match.slot < 0) & ~match.ambiguous & ~near_lines(new, lines, thresholds, rules)
     slot, overflow = free_slots(fresh, model.valid)
     # A circle that is not fitted is the visible arc and moves with the viewpoint: its covariance is this scan's alone.
     names = ("cov_independent", "sqrt_persistent")
@@ -434,7 +434,7 @@ def _update_circles(
     # Only lines that this scan touched can have come near a circle.
     touched = take(lines, targets)
     touched = dataclasses.replace(touched, valid=touched.valid & (targets >= 0))
-    near = near_lines(model, touched, thresholds)
+    near = near_lines(model, touched, thresholds, rules)
     model = dataclasses.replace(model, valid=model.valid & ~near)
     report = jnp.where(match.slot >= 0, match.slot, jnp.where(slot >= 0, NEW, LEFT_OUT))
     return _CircleUpdate(

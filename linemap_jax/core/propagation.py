@@ -55,7 +55,7 @@ def product(a: Float[Array, "*#s l m"], b: Float[Array, "*#s m n"]) -> Float[Arr
     return jnp.sum(a[..., :, :, None] * b[..., None, :, :], -2)
 
 
-def apply(matrix: Float[Array, "*s m n"], vector: Float[Array, "*s n"]) -> Float[Array, "*s m"]:
+def apply(matrix: Float[Array, "*#s m n"], vector: Float[Array, "*#s n"]) -> Float[Array, "*s m"]:
     """`matrix` times `vector` for many small matrices."""
     return jnp.sum(matrix * vector[..., None, :], -1)
 
@@ -121,7 +121,7 @@ def safe_sqrt(x: Float[Array, "*s"]) -> Float[Array, "*s"]:
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1)), 0)
 
 
-def quadratic(vector: Float[Array, "*s n"], matrix: Float[Array, "*s n n"]) -> Float[Array, "*s"]:
+def quadratic(vector: Float[Array, "*#s n"], matrix: Float[Array, "*#s n n"]) -> Float[Array, "*s"]:
     """x^T A x, of x = `vector` and A = `matrix`."""
     return jnp.sum(vector * apply(matrix, vector), -1)
 

@@ -191,8 +191,9 @@ class Rules:
     estimate_ends: bool = True
     """End points are estimated. The rule of s5.1.2 only ever lengthens a line, so noise makes it grow."""
     weigh_circles: bool = True
-    """Circles are fused by their covariance, or by the number of times that they were seen. Eqs. (24)-(25) weigh the
-    newest by one half, however often the other was seen."""
+    """Circles are fused by their covariance, or by the number of times that they were seen; and no line takes the place
+    of a circle that was seen more often. Eqs. (24)-(25) weigh the newest by one half, however often the other was
+    seen."""
     wipe_by_beams: bool = True
     """Wipe what this scan's beams passed through. The paper's triangle spans the whole fused line, also where this
     scan did not look, and needs a line behind what vanished."""

@@ -407,7 +407,8 @@ def passed_circles(
 
     A circle is gone if every beam through the window in which it may stand, at least two of them, ends beyond it; and
     if no two of them, nor the last of them and the edge of that window, are so far apart that it may stand between: a
-    pole at the rim of what the scanner sees, or among beams without a return, stays.
+    pole at the rim of what the scanner sees, or among beams without a return, stays. A beam that meets it by less than
+    beams err by may have gone past, so that a thin pole far away stays too.
 
     Args:
       circles: the `C` circles of the map.
@@ -426,8 +427,8 @@ def passed_circles(
     beams, next_beams = swath.points.beam, swath.points.beam[following]
     follows = swath.points.valid[following]
 
-    def window(center: Array) -> tuple[Array, Array, Array]:
-        """Where a circle is seen, and what its place errs by aside and in depth."""
+    def window(center: Array) -> tuple[Array, Array, Array, Array]:
+        """Where a circle is seen, and what its place errs by aside and in depth, and beams aside."""
         from_robot = center - swath.robot
         to_center = from_robot - swath.points.laser
         distance = jnp.sqrt(dot(to_center, to_center))
@@ -437,23 +438,25 @@ def passed_circles(
             jac = jnp.concatenate([direction, dot(direction, perp(from_robot))[None]])
             return quadratic(jac, cov_pose)
 
-        lateral = jnp.sqrt(spread(perp(ahead)) + (distance * noise.bearing_sigma) ** 2)
+        slack = distance * noise.bearing_sigma
+        lateral = jnp.sqrt(spread(perp(ahead)) + slack**2)
         depth = jnp.sqrt(spread(ahead) + noise.range_sigma**2)
-        return to_center, thresholds.wipe_sigmas * lateral, thresholds.wipe_sigmas * depth
+        return to_center, *(thresholds.wipe_sigmas * sigma for sigma in (lateral, depth, slack))
 
-    def gone(to_center: Array, unsure: Array, deep: Array, radius: Array) -> Array:
+    def gone(to_center: Array, unsure: Array, deep: Array, slack: Array, radius: Array) -> Array:
         along, next_along = dot(beams, to_center[None]), dot(next_beams, to_center[None])
         aside, next_aside = _cross(beams, to_center[None]), _cross(next_beams, to_center[None])
         witness = swath.points.valid & (jnp.abs(aside) < radius + unsure) & (along > 0)
         next_too = follows & (jnp.abs(next_aside) < radius + unsure) & (next_along > 0)
         beyond = swath.points.range > along + radius + deep
-        wide = witness & next_too & (aside - next_aside > 2 * radius)
-        to_left, to_right = witness & (aside <= radius - unsure), witness & (aside >= unsure - radius)
+        met = radius - slack  # a beam that passes the centre by less has met the circle, if it is there
+        wide = witness & next_too & (aside - next_aside > 2 * met)
+        to_left, to_right = witness & (aside <= met - unsure), witness & (aside >= unsure - met)
         covered = jnp.any(to_left) & jnp.any(to_right) & (jnp.sum(witness) >= 2)
         return covered & ~jnp.any(wide | (witness & ~beyond))
 
-    to_center, unsure, deep = computed_once(jax.vmap(window), circles.center)
-    return circles.valid & jax.vmap(gone)(to_center, unsure, deep, circles.radius)
+    windows = computed_once(jax.vmap(window), circles.center)
+    return circles.valid & jax.vmap(gone)(*windows, circles.radius)
 
 
 def circles_inside_triangles(circles: Circles, triangles: Triangles) -> Bool[Array, " C"]:

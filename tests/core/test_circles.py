@@ -324,7 +324,17 @@ def test_near_a_line(x: float, y: float, radius: float, fitted: bool, near: bool
         valid=jnp.array([True, False]),
     )
     thresholds = Thresholds(circle_line_distance=0.15)
-    assert bool(near_lines(circle_at(x, y, radius, fitted), line, thresholds)[0]) == near
+    assert bool(near_lines(circle_at(x, y, radius, fitted), line, thresholds, Rules())[0]) == near
+
+
+@pytest.mark.parametrize(("of_circle", "of_line", "counts"), [(1, 1, True), (5, 4, False), (5, 5, True), (5, 6, True)])
+def test_a_line_seen_more_seldom_takes_no_place(of_circle: int, of_line: int, counts: bool) -> None:
+    line = dataclasses.replace(
+        empty_lines(1), extent=jnp.array([[-1.0, 1.0]]), times_detected=jnp.array([of_line]), valid=jnp.array([True])
+    )
+    circle = dataclasses.replace(circle_at(0.0, 0.0, 0.05, True), times_detected=jnp.array([of_circle]))
+    assert bool(near_lines(circle, line, Thresholds(), Rules())[0]) == counts
+    assert bool(near_lines(circle, line, Thresholds(), Rules(weigh_circles=False))[0])
 
 
 def test_circles_near_a_line_are_dropped_and_counted() -> None:

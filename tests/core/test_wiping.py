@@ -342,8 +342,16 @@ def test_a_wall_does_not_wipe_its_own_back() -> None:
 
 @pytest.mark.parametrize(
     ("x", "radius", "gone"),
-    # Beams are 3.5 cm apart at 2 m: a pole of 4 cm cannot stand between two of them, one of 1 cm can.
-    [(2.0, 0.1, True), (2.95, 0.1, False), (4.0, 0.1, False), (2.0, 0.02, True), (2.0, 0.005, False)],
+    # Beams are 3.5 cm apart at 2 m: a pole of 5 cm cannot stand between two of them, one of 1 cm can. One of 4 cm cannot
+    # either, but beams that are off by 3 mrad each may have gone past it: 4 - 2 * 0.6 cm is less than 3.5.
+    [
+        (2.0, 0.1, True),
+        (2.95, 0.1, False),
+        (4.0, 0.1, False),
+        (2.0, 0.025, True),
+        (2.0, 0.02, False),
+        (2.0, 0.005, False),
+    ],
 )
 def test_circles_that_beams_passed(x: float, radius: float, gone: bool) -> None:
     found = lines_of(([3.0, -3.0], [3.0, 3.0]), capacity=1)
@@ -356,7 +364,6 @@ def test_circles_that_beams_passed(x: float, radius: float, gone: bool) -> None:
 def test_a_circle_stays_where_it_may_stand_between_beams_or_beside_them() -> None:
     """Not gone while it can hide: at the rim of the view, or where beams came back with nothing."""
     pole = circle_at(2.0, 0.0, 0.1)
-    # Of 1 cm, 2 mrad and 3 sigma the window is 3.7 cm wider than the pole on either side.
     for low, high, without, gone in (
         (-45, 46, (), True),
         (1, 46, (), True),
