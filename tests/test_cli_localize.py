@@ -1,5 +1,6 @@
 """`linemap localize`: a drive through a room that the map knows, and on into one that it does not."""
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -9,9 +10,11 @@ import pytest
 from maps import lines_between, poles_at
 
 from linemap_jax.cli import main
+from linemap_jax.cli.localize import Localize, _noise_of, _states_noise
+from linemap_jax.core.settings import SensorNoise
 from linemap_jax.core.state import LineMap
 from linemap_jax.io.carmen_writer import write_carmen
-from linemap_jax.io.map_file import write_map
+from linemap_jax.io.map_file import read_map, write_map
 from linemap_jax.io.tum import read_tum
 
 BEAMS, KNOWN, UNKNOWN = 181, 24, 12
@@ -110,11 +113,46 @@ def test_the_way_through_a_room_and_out_of_the_map(room: dict[str, Any], capsys:
 
 
 def test_where_it_begins_is_told(room: dict[str, Any], tmp_path: Path, capsys: Any) -> None:
-    for options, told in (([], True), (["--quiet"], False), (["--start", "1", "1.2", "0.3"], False)):
+    for options, told in (([], True), (["--start", "1", "1.2", "0.3"], False)):
         path = tmp_path / f"{len(options)}.tum"
         assert main(["localize", str(room["map"]), str(room["log"]), "-o", str(path), *options]) == 0
         sentence = "linemap: without --start the first pose of the log is taken: 0.00 0.00 0.00\n"
         assert (sentence in capsys.readouterr().err) == told
+
+
+def test_noise_that_is_not_stated_is_the_maps(tmp_path: Path) -> None:
+    log, out, config = Path("a.log"), Path("a.tum"), tmp_path / "noise.toml"
+    command = Localize(map=Path("map.json"), log=log, output=out)
+    assert not _states_noise(command)
+    config.write_text("[thresholds]\nmin_length = 0.3\n")
+    assert not _states_noise(dataclasses.replace(command, config=config))
+    config.write_text("[noise]\nrange_sigma = 0.03\n")
+    for stated in ({"config": config}, {"scanner": "pls"}, {"range_sigma": 0.01}, {"bearing_sigma": 0.0}):
+        assert _states_noise(dataclasses.replace(command, **stated))
+
+    one, other = ({"noise": {"range_sigma": sigma, "bearing_sigma": 0.002}} for sigma in (0.01, 0.02))
+    assert _noise_of(one) == SensorNoise(range_sigma=0.01, bearing_sigma=0.002)
+    assert _noise_of({"merged": [one, {"merged": [one, one]}]}) == _noise_of(one)
+    for settings in ({}, {"merged": [one, other]}, {"merged": [one, 3]}, {"merged": []}):
+        assert _noise_of(settings) is None
+    for noise in (1, {"range_sigma": 0.01}, {"range_sigma": "much", "bearing_sigma": 0.0}):
+        assert _noise_of({"noise": noise}) is None
+
+
+def test_the_noise_of_the_map_counts(room: dict[str, Any], tmp_path: Path) -> None:
+    """As if it were stated; and what is stated goes before it."""
+    line_map, _ = read_map(room["map"], dtype="float32")
+    write_map(tmp_path / "map.json", line_map, {"noise": {"range_sigma": 0.05, "bearing_sigma": 0.001}})
+    way = {}
+    for name, of_map, options in (
+        ("map", tmp_path / "map.json", []),
+        ("stated", room["map"], ["--range-sigma", "0.05"]),
+        ("other", tmp_path / "map.json", ["--range-sigma", "0.02"]),
+    ):
+        path = tmp_path / f"{name}.tum"
+        assert main(["localize", str(of_map), str(room["log"]), "-o", str(path), "--quiet", *options]) == 0
+        way[name] = path.with_suffix(".csv").read_text()
+    assert way["map"] == way["stated"] != way["other"]
 
 
 def test_what_is_refused(room: dict[str, Any], tmp_path: Path, capsys: Any) -> None:

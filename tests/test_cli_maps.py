@@ -160,6 +160,19 @@ def test_every_format_by_its_ending(built: Path, run: Any, tmp_path: Path) -> No
     assert stamps.tolist() == [100 + i for i in range(SCANS)]
 
 
+def test_what_was_detected_too_seldom_is_left_out(built: Path, run: Any, tmp_path: Path) -> None:
+    whole = document(built / "a/map.json")
+    times = sorted(x["times_detected"] for x in whole["lines"] + whole["circles"])
+    least = times[len(times) // 2]
+    assert times[0] < least
+    options = ["--at-least", str(least), "--quiet"]
+    assert run("export", built / "a/map.json", "-o", tmp_path / "map.json", *options) == (0, "", "")
+    found = document(tmp_path / "map.json")
+    for kind in ("lines", "circles"):
+        assert found[kind] == [x for x in whole[kind] if x["times_detected"] >= least]
+    assert found["settings"] == whole["settings"] | {"at_least": least}
+
+
 def test_a_map_may_be_given_by_its_folder_and_a_folder_for_the_file_is_made(
     built: Path, run: Any, tmp_path: Path
 ) -> None:
@@ -250,6 +263,7 @@ def test_what_is_refused(built: Path, refuse: Any, tmp_path: Path) -> None:
         assert refuse("export", good, "-o", tmp_path / "map", "--to", name) == (
             f"{name} is made from the scans of a log; give --log"
         )
+    assert "--at-least must be 1 or more, not 0" in refuse("export", good, "-o", to, "--at-least", 0)
     assert "--resolution must be positive" in refuse("export", good, "-o", to, "--resolution", 0)
     assert "million cells" in refuse("export", good, "-o", tmp_path / "m.yaml", "--log", log, "--resolution", 1e-4)
     assert "cannot be read: No such file" in refuse("export", good, "-o", to, "--log", tmp_path / "none.log")

@@ -134,9 +134,8 @@ def _in_words(found: "Comparison") -> str:
         if what in ASK and any(change.passed is None for change in changes):
             said.append(f"  {ASK[what]}")
         if len(changes) > len(sure):
-            said.append(
-                f"  {len(changes) - len(sure)} more are in one map only, but the other drive did not see through"
-            )
+            more = f"{len(changes) - len(sure)} more are in one map only, but the other drive did not see through"
+            said.append(f"  {more}; --json tells where")
     return "\n".join(said)
 
 

@@ -13,6 +13,7 @@ from linemap_jax.cli.options import LogInput, UsageError, check_input
 from linemap_jax.cli.output import check_output, make_folder, say
 
 if TYPE_CHECKING:
+    from linemap_jax.core.state import LineMap
     from linemap_jax.io.reading import Log
 
 FormatName = Literal["json", "geojson", "svg", "dxf", "nav2", "mcap", "tum", "png", "html"]
@@ -32,6 +33,8 @@ class Export(LogInput):
     log: Annotated[Path | None, tyro.conf.arg(metavar="LOG")] = None
     """CARMEN log or ROS bag, in the frame of the map: `nav2` makes its grid of the scans, `tum` writes the poses,
     pictures show the path."""
+    at_least: Annotated[int, tyro.conf.arg(metavar="N")] = 1
+    """Leave out lines and circles that fewer than N scans have detected: what was seen once or twice may be none."""
     resolution: Annotated[float, tyro.conf.arg(metavar="M")] = 0.05
     """Side of a cell of `nav2`, m."""
     overwrite: bool = False
@@ -51,6 +54,8 @@ class Export(LogInput):
             raise UsageError(f"{name} is made from the scans of a log; give --log")
         if not 0 < self.resolution < float("inf"):
             raise UsageError(f"--resolution must be positive, not {self.resolution}")
+        if self.at_least < 1:
+            raise UsageError(f"--at-least must be 1 or more, not {self.at_least}")
         check_input(self)
         check_output(self.output.parent, *files_of(name, self.output), overwrite=self.overwrite)
         import jax
@@ -60,6 +65,8 @@ class Export(LogInput):
         from linemap_jax.io.map_file import read_map
 
         line_map, settings = read_map(self.map)
+        if self.at_least > 1:
+            line_map, settings = _often(line_map, self.at_least), {**settings, "at_least": self.at_least}
         added: dict[str, Any] = {}
         if self.log is not None and name not in ("json", "geojson"):
             command = at_poses_of_map(self, self.log, self.map, settings, quiet=self.quiet)
@@ -75,6 +82,17 @@ class Export(LogInput):
         FORMATS[name].write(self.output, content, self.overwrite)
         say(f"{self.map} -> {self.output} ({name})", quiet=self.quiet)
         return 0
+
+
+def _often(line_map: "LineMap", times: int) -> "LineMap":
+    """What of a map was detected so many times."""
+    from linemap_jax.core.slots import neutral_where_free
+    from linemap_jax.core.state import LineMap
+
+    lines, circles = line_map.lines, line_map.circles
+    lines = dataclasses.replace(lines, valid=lines.valid & (lines.times_detected >= times))
+    circles = dataclasses.replace(circles, valid=circles.valid & (circles.times_detected >= times))
+    return LineMap(lines=neutral_where_free(lines), circles=neutral_where_free(circles))
 
 
 def _read(command: Export, log: "Log", name: str, fit: Fit) -> dict[str, Any]:

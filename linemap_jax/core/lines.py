@@ -298,7 +298,7 @@ def measure_lines(
 def _ends(
     points: Points, runs: Runs, anchor: Float[Array, "K 2"], line: Float[Array, "2 K"], noise: SensorNoise
 ) -> Int[Array, "K 2"]:
-    """Which points end each line: the first and last of its run, if they lie on the line, else the outermost of the fit.
+    """Which points end each line: the first and last of its run where they lie on it, else the outermost of the fit.
 
     Far away a run may go on round a corner. The points there are left out of the fit, and the last of them may lie
     decimetres beside the line; what is on the line by `UNSURE_SIGMAS` may end it, fitted or not.

@@ -441,7 +441,8 @@ def passed_circles(
         slack = distance * noise.bearing_sigma
         lateral = jnp.sqrt(spread(perp(ahead)) + slack**2)
         depth = jnp.sqrt(spread(ahead) + noise.range_sigma**2)
-        return to_center, *(thresholds.wipe_sigmas * sigma for sigma in (lateral, depth, slack))
+        unsure, deep, slack = (thresholds.wipe_sigmas * sigma for sigma in (lateral, depth, slack))
+        return to_center, unsure, deep, slack
 
     def gone(to_center: Array, unsure: Array, deep: Array, slack: Array, radius: Array) -> Array:
         along, next_along = dot(beams, to_center[None]), dot(next_beams, to_center[None])
@@ -455,8 +456,8 @@ def passed_circles(
         covered = jnp.any(to_left) & jnp.any(to_right) & (jnp.sum(witness) >= 2)
         return covered & ~jnp.any(wide | (witness & ~beyond))
 
-    windows = computed_once(jax.vmap(window), circles.center)
-    return circles.valid & jax.vmap(gone)(*windows, circles.radius)
+    to_center, unsure, deep, slack = computed_once(jax.vmap(window), circles.center)
+    return circles.valid & jax.vmap(gone)(to_center, unsure, deep, slack, circles.radius)
 
 
 def circles_inside_triangles(circles: Circles, triangles: Triangles) -> Bool[Array, " C"]:

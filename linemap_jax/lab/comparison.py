@@ -31,8 +31,10 @@ from linemap_jax.lab.world import NEVER, Kind, Poles, Segments, World
 
 OVERLAP = 0.5
 """Lines may be the same one if that share of the shorter, at least, lies beside the other."""
-FARTHEST_TURN = 0.2
-"""rad, 11 degrees. A line that has turned more has vanished, and another one has appeared."""
+FARTHEST_TURN = 0.6
+"""rad, 34 degrees. A line that has turned more has vanished, and another one has appeared."""
+ALONG = 0.2
+"""rad, 11 degrees. A line that is turned more lies on no other one."""
 END_SIGMAS = 3.0
 """An end of a line is known to so many sigmas; less than that is no missing piece."""
 END_SLACK = 0.1
@@ -163,7 +165,7 @@ class Agreement(NamedTuple):
     overlap: float
     """Length of lines within `REACH` of a line of the other map, m; the mean of both maps."""
     agreeing: float
-    """Length of lines that lie along one of the other map, within `BESIDE` and `FARTHEST_TURN`, m; the mean of both."""
+    """Length of lines that lie along one of the other map, within `BESIDE` and `ALONG`, m; the mean of both."""
 
 
 def agreement(a: LineMap, b: LineMap) -> Agreement:
@@ -311,7 +313,7 @@ def _lie_on(walls: _Walls) -> Bool[np.ndarray, "K K"]:
     ends = np.stack([walls.begin, walls.end], 1)[:, None] - walls.foot[None, :, None]  # of each, from each other one
     across, along = (np.einsum("klei,li->kle", ends, axis) for axis in (walls.normal, walls.tangent))
     low, high = (walls.extent[:, side] + slack for side, slack in ((0, -END_SLACK), (1, END_SLACK)))
-    turned = np.abs(walls.tangent @ walls.normal.T) > math.sin(FARTHEST_TURN)
+    turned = np.abs(walls.tangent @ walls.normal.T) > math.sin(ALONG)
     beside = (np.abs(across) <= BESIDE).all(-1) & (low[:, None] <= along).all(-1) & (along <= high[:, None]).all(-1)
     piece = beside & ~turned & (length[:, None] < length) & walls.valid[:, None] & walls.valid
     return piece | np.eye(len(length), dtype=bool)
@@ -330,7 +332,7 @@ def _lengths_beside(lines: _Walls, others: _Walls) -> tuple[float, float]:
         way = lines.foot[i] + places[:, None] * lines.tangent[i] - begin[:, None]  # [others, places, 2]
         across, ahead = (np.einsum("lpi,li->lp", way, axis) for axis in (normal, tangent))
         far = np.hypot(across, ahead - np.clip(ahead, low[:, None], high[:, None]))
-        parallel = np.abs(normal @ lines.tangent[i]) <= math.sin(FARTHEST_TURN)
+        parallel = np.abs(normal @ lines.tangent[i]) <= math.sin(ALONG)
         near += (far <= REACH).any(0).mean() * (last - first)
         along += (far[parallel] <= BESIDE).any(0).mean() * (last - first)
     return float(near), float(along)

@@ -373,3 +373,27 @@ def test_three_points_of_two_walls_are_no_line() -> None:
         rules = Rules(leave_out_sparse=False, check_ends=rule)
         found = extract(scan, Pose(mean=jnp.zeros(3), cov=jnp.zeros((3, 3))), rules=rules)
         assert bool(found.lines.valid[0]) == a_line
+
+
+@pytest.mark.parametrize("end", [0, 8])
+@pytest.mark.parametrize(("off", "on_line"), [(0.0, True), (0.029, True), (0.031, False)])
+def test_a_point_that_was_left_out_ends_a_line_only_if_it_lies_on_it(end: int, off: float, on_line: bool) -> None:
+    """Of nine points of a wall 10 m ahead three at one end are not fitted; by 3 sigma, which is 3 cm across it."""
+    bearings = np.radians(np.arange(-4.0, 5.0))
+    ranges = 10 / np.cos(bearings)
+    ranges[end] += off / np.cos(bearings[end])
+    here = Pose(mean=jnp.zeros(3), cov=jnp.zeros((3, 3)))
+    points = points_from_scan(Scan.from_ranges(ranges, bearings), here, Mount(), jacobians="analytic")
+    fitted = np.abs(np.arange(9) - end) > 2
+    runs = runs_at(9, (0, 8))
+    runs = dataclasses.replace(runs, of_point=jnp.where(fitted, runs.of_point, -1))
+    noise = SensorNoise(range_sigma=0.01 / np.cos(bearings[end]), bearing_sigma=0.0)
+    lines, _, _ = measure_lines(
+        points, here, runs, noise, maximum_likelihood=True, covariance="exact", jacobians="analytic"
+    )
+    ends = np.stack([lines.begin[0], lines.end[0]])
+    y = 10 * np.tan(bearings)
+    y[end] *= 1 + off / 10
+    outermost = end if on_line else abs(end - 3)
+    expected = [y[outermost], y[8]] if end == 0 else [y[0], y[outermost]]
+    np.testing.assert_allclose(ends, np.stack([[10.0, 10.0], expected], -1), atol=1e-9)

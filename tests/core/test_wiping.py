@@ -342,8 +342,8 @@ def test_a_wall_does_not_wipe_its_own_back() -> None:
 
 @pytest.mark.parametrize(
     ("x", "radius", "gone"),
-    # Beams are 3.5 cm apart at 2 m: a pole of 5 cm cannot stand between two of them, one of 1 cm can. One of 4 cm cannot
-    # either, but beams that are off by 3 mrad each may have gone past it: 4 - 2 * 0.6 cm is less than 3.5.
+    # Beams are 3.5 cm apart at 2 m: a pole of 5 cm cannot stand between two of them, one of 1 cm can. One of 4 cm
+    # cannot either, but beams that are off by 3 mrad each may have gone past it: 4 - 2 * 0.6 cm is less than 3.5.
     [
         (2.0, 0.1, True),
         (2.95, 0.1, False),

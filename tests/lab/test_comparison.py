@@ -79,6 +79,22 @@ def test_one_box_moved_and_one_vanished() -> None:
     assert all(change.shift == pytest.approx((-0.3, 0.0), abs=0.05) for change in told(back, "moved"))
 
 
+def test_a_box_that_was_turned() -> None:
+    def turned(angle: float) -> np.ndarray:
+        rotation = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+        return outline((rotation @ np.array([(-1, -0.5), (1, -0.5), (1, 0.5), (-1, 0.5)]).T).T)
+
+    found = compare_maps(seen(turned(0.1)), seen(turned(0.5), seed=1))
+    assert [change.what for change in found.changes] == 4 * ["moved"]
+    for change in found.changes:
+        assert change.turn == pytest.approx(0.4, abs=0.02)
+        assert change.shift == pytest.approx((0, 0), abs=0.1)
+        assert change.slot_a == change.slot_b
+    # Farther than that it is another one.
+    found = compare_maps(seen(turned(0.0)), seen(turned(0.7), seed=1))
+    assert [len(told(found, what)) for what in ("moved", "vanished", "appeared")] == [0, 4, 4]
+
+
 def test_a_door_that_was_opened_and_a_line_that_was_seen_farther() -> None:
     def wall(*spans: tuple[float, float]) -> np.ndarray:
         return np.array([[(low, 1.0), (high, 1.0)] for low, high in spans])
