@@ -119,12 +119,13 @@ def tell_poses(command: LogOptions, log: "Log") -> str:
     notes = log.notes
     stated, scans = notes.stated_covs, notes.scans
     sigma = "--pose-sigma " + " ".join(f"{x:g}" for x in command.pose_sigma)
+    by_whom = "as the log states it" if command.poses is None else "as the table beside the poses states it"
     if stated == scans:
-        noise = "as the log states it"
+        noise = by_whom
     elif stated == 0:
         noise = sigma
     else:
-        noise = f"as the log states it for {stated} of {scans} scans, {sigma} for the others"
+        noise = f"{by_whom} for {stated} of {scans} scans, {sigma} for the others"
     mounting = f"; laser on the robot: {notes.mounting}" if notes.mounting else ""
     return f"{notes.poses}; noise: {noise}{mounting}"
 

@@ -49,7 +49,8 @@ class LogInput:
     """Topic of the odometry to take poses from, for a bag with several, or in place of tf."""
     poses: Annotated[Path | None, tyro.conf.arg(metavar="FILE.tum")] = None
     """Poses of the robot (timestamp tx ty tz qx qy qz qw), in place of those of the log; of the laser, if a comment in
-    the file says so, as `linemap slam` writes it."""
+    the file says so, as `linemap slam` writes it. Their covariances are those of the table FILE.csv that `slam` and
+    `localize` write beside it, if it is there."""
     standstill: bool = False
     """The robot did not move: for a log without poses."""
     strict: bool = False
@@ -72,7 +73,8 @@ class LogOptions(LogInput):
     bearing_sigma: Annotated[float | None, tyro.conf.arg(metavar="RAD")] = None
     """Standard deviation of a bearing, rad. That of the scanner, or 0.001, unless given."""
     pose_sigma: Annotated[tuple[float, float, float], tyro.conf.arg(metavar="X Y THETA")] = POSE_SIGMA
-    """Standard deviations of every pose for which the log states no covariance, m m rad."""
+    """Standard deviations of every pose for which neither the log nor a table beside --poses states a covariance,
+    m m rad."""
     covariance: Literal["exact", "printed"] | None = None
     """`exact` to first order, or eq. 12 as `printed`. That of the preset unless given."""
     jacobians: Literal["autodiff", "analytic"] = "analytic"

@@ -138,6 +138,7 @@ class CarmenLog:
                     notes.without_pose += 1
                 elif reading is not None:
                     notes.deliver(number, reading.timestamp, reading.ranges.size)
+                    notes.stated_covs += reading.cov_pose is not None
                     yield reading
             if self.progress is not None:
                 self.progress(size, size)
@@ -300,10 +301,11 @@ class _Parser:
             self._sweep = (first, step, ranges.size)
             self._bearings = first + step * np.arange(ranges.size)
             self._bearings.setflags(write=False)
-        stamp, pose = float(tail[-1]), tail[:3].copy()
+        stamp, pose, cov = float(tail[-1]), tail[:3].copy(), None
         if options.poses is not None:
             known = poses_of_sweep(options.poses, stamp, 0.0, ranges.size)
             pose = None if known is None else known[0]
+            cov = None if known is None else options.poses.cov_at(stamp)
         return Reading(
             timestamp=stamp,
             ranges=ranges,
@@ -311,7 +313,7 @@ class _Parser:
             range_min=options.range_min or 0.0,
             range_max=range_max if options.range_max is None else float(options.range_max),
             pose=pose,
-            cov_pose=None,
+            cov_pose=cov,
             time_increment=0.0,
             sweep_poses=None,
             pose_frame="laser" if options.poses is None else options.pose_frame,

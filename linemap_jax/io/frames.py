@@ -126,26 +126,36 @@ class Trajectory:
       pose_frame: whose poses they are.
     """
 
-    def __init__(self, stamps: np.ndarray, poses: np.ndarray, pose_frame: Literal["robot", "laser"] = "robot") -> None:
+    def __init__(
+        self,
+        stamps: np.ndarray,
+        poses: np.ndarray,
+        pose_frame: Literal["robot", "laser"] = "robot",
+        covs: np.ndarray | None = None,
+    ) -> None:
         """A trajectory from stamps, s, and poses x, y, theta, m, m, rad.
 
         Args:
           stamps: finite, in any order; of equal ones the first counts. Shape `[T]`.
           poses: finite. Shape `[T, 3]`.
           pose_frame: whose poses they are.
+          covs: of the poses, m^2, m rad, rad^2. Shape `[T, 3, 3]`. None if they are not stated.
 
         Raises:
-          ValueError: if there is no pose, or if stamps and poses differ in number or are not finite.
+          ValueError: if there is no pose, or if stamps, poses and covariances differ in number or are not finite.
         """
         stamps, poses = np.asarray(stamps, float), np.asarray(poses, float)
         if stamps.ndim != 1 or poses.shape != (stamps.size, 3) or stamps.size == 0:
             raise ValueError(f"a trajectory needs T stamps and [T, 3] poses, not {stamps.shape} and {poses.shape}")
-        if not (np.isfinite(stamps).all() and np.isfinite(poses).all()):
-            raise ValueError("a stamp or a pose of the trajectory is not finite")
+        if covs is not None and covs.shape != (stamps.size, 3, 3):
+            raise ValueError(f"{stamps.size} poses need covariances [T, 3, 3], not {covs.shape}")
+        if not all(np.isfinite(x).all() for x in (stamps, poses, *([] if covs is None else [covs]))):
+            raise ValueError("a stamp, a pose or a covariance of the trajectory is not finite")
         self.pose_frame: Literal["robot", "laser"] = pose_frame
         self.description = "of a given trajectory" + (" of the laser" if pose_frame == "laser" else "")
         self.stamps, index = np.unique(stamps, return_index=True)
         self.poses = poses[index]
+        self.covs = None if covs is None else covs[index]
         self.poses[:, 2] = np.unwrap(self.poses[:, 2])
         # One step more, if there is a step.
         self._knots = np.append(self.stamps, self.stamps[-1] + np.diff(self.stamps[-2:]))
@@ -164,8 +174,18 @@ class Trajectory:
         """Poses at stamps that are covered. `[n]` s -> `[n, 3]` m, m, rad."""
         return _interpolated(stamps, self._knots, self._poses_at_knots)
 
-    def cov_at(self, stamp: float) -> None:
-        """None: nothing is stated."""
+    def cov_at(self, stamp: float) -> np.ndarray | None:
+        """Covariance of the pose at a stamp, if they are stated. Shape `[3, 3]`.
+
+        Between two poses it is interpolated: a bound of that of the pose between, however the errors hang together.
+        """
+        if self.covs is None:
+            return None
+        after = int(np.clip(np.searchsorted(self.stamps, stamp), 0, self.stamps.size - 1))
+        before = max(after - 1, 0)
+        step = self.stamps[after] - self.stamps[before]
+        share = float(np.clip((stamp - self.stamps[before]) / step, 0, 1)) if step > 0 else 1.0
+        return (1 - share) * self.covs[before] + share * self.covs[after]
 
 
 class Standstill:

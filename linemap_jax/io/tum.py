@@ -2,6 +2,7 @@
 
 import os
 import re
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -11,6 +12,10 @@ from linemap_jax.io.atomic import atomic_write
 from linemap_jax.io.frames import Trajectory, planar, transform_of
 from linemap_jax.io.reading import LogError
 
+_HEAD = "timestamp,x,y,theta,cov_xx,cov_xy,cov_xtheta,cov_yy,cov_ytheta,cov_thetatheta,"
+"""Of a table of covariances: what its columns are; marks follow."""
+ROUNDED_POSE = 1e-5
+"""s, m, rad. By so much the poses of the two files may differ."""
 _WHOSE = re.compile(r"#\s*poses of the (robot|laser)\b")
 """The comment by which a trajectory says whose poses it holds."""
 
@@ -18,13 +23,15 @@ _WHOSE = re.compile(r"#\s*poses of the (robot|laser)\b")
 def read_tum(path: str | os.PathLike[str]) -> Trajectory:
     """Read poses, one a line: `timestamp tx ty tz qx qy qz qw`, seen from above; lines that begin with # are comments.
 
-    They are the robot's, unless a comment has it that they are `poses of the laser`.
+    They are the robot's, unless a comment has it that they are `poses of the laser`. If a table of `write_covariances`
+    lies beside the file, under its name with the ending .csv, their covariances are those.
 
     Args:
       path: of the file.
 
     Raises:
-      LogError: if the file cannot be read, a line is no pose, or there is none; it names the line.
+      LogError: if the file cannot be read, a line is no pose, or there is none; it names the line. If the table is of
+        other poses, or damaged.
     """
     stamps, poses, pose_frame = [], [], "robot"
     try:
@@ -46,7 +53,41 @@ def read_tum(path: str | os.PathLike[str]) -> Trajectory:
         raise LogError(path, "is no text, so not a trajectory in the format of TUM") from error
     if not stamps:
         raise LogError(path, "holds no pose")
-    return Trajectory(np.array(stamps), np.array(poses), "laser" if pose_frame == "laser" else "robot")
+    trajectory = np.array(stamps), np.array(poses)
+    covs = _covariances_beside(Path(path).with_suffix(".csv"), *trajectory)
+    return Trajectory(*trajectory, "laser" if pose_frame == "laser" else "robot", covs)
+
+
+def _covariances_beside(path: Path, stamps: np.ndarray, poses: np.ndarray) -> np.ndarray | None:
+    """The covariances of poses, `[T, 3, 3]`, from the table beside them; None if there is none."""
+    try:
+        head, *rows = path.read_text(encoding="ascii").splitlines()
+    except (OSError, ValueError):  # there is none, or it is empty, or no text
+        return None
+    if not head.startswith(_HEAD):
+        return None
+    try:
+        columns = _HEAD.count(",")
+        table = np.array([row.split(",")[:columns] for row in rows], float).reshape(len(rows), columns)
+    except ValueError as error:
+        raise LogError(path, "is no table of covariances: a row holds something else than numbers") from error
+    if not (len(table) == len(poses) and _are_close(table[:, :4], np.column_stack([stamps, poses]))):
+        raise LogError(path, "tells the covariances of other poses than those beside it; move one of the two away")
+    covs = np.zeros((len(table), 3, 3))
+    covs[:, *np.triu_indices(3)] = table[:, 4:]
+    covs += np.swapaxes(np.triu(covs, 1), 1, 2)
+    sigmas = np.sqrt(np.maximum(np.diagonal(covs, axis1=1, axis2=2), 0))
+    bound = 1.001 * sigmas[:, :, None] * sigmas[:, None]
+    if not (np.isfinite(covs).all() and np.all(np.abs(covs) <= bound)):
+        raise LogError(path, "holds a covariance that is none")
+    return covs
+
+
+def _are_close(one: np.ndarray, other: np.ndarray) -> bool:
+    """Whether stamps and poses are the same, up to the digits in which files hold them. Shape `[T, 4]` each."""
+    off = one - other
+    off[:, 3] = np.mod(off[:, 3] + np.pi, 2 * np.pi) - np.pi
+    return bool(np.all(np.abs(off) < ROUNDED_POSE))
 
 
 def _pose(fields: list[str]) -> tuple[float, float, float] | None:
@@ -116,7 +157,7 @@ def write_covariances(
     upper = np.asarray(covs, float)[:, *np.triu_indices(3)]
     marks = {"keyframe": keyframes} if keyframes is not None else {}
     marks |= {"lost": lost}
-    head = f"timestamp,x,y,theta,cov_xx,cov_xy,cov_xtheta,cov_yy,cov_ytheta,cov_thetatheta,{','.join(marks)}\n"
+    head = f"{_HEAD}{','.join(marks)}\n"
     marked = np.stack([np.asarray(mark, int) for mark in marks.values()], -1)
     rows = zip(np.asarray(timestamps, float), np.asarray(poses, float), upper, marked, strict=True)
     text = "".join(

@@ -20,7 +20,7 @@ from linemap_jax.io.frames import (
     upright,
 )
 from linemap_jax.io.reading import LogError
-from linemap_jax.io.tum import read_tum, write_tum
+from linemap_jax.io.tum import read_tum, write_covariances, write_tum
 
 
 def some(seed: int):
@@ -180,6 +180,59 @@ def test_a_file_that_is_no_trajectory(tmp_path, text, cause):
     assert str(caught.value).startswith(f"{path}{cause}")
     with pytest.raises(LogError, match="No such file"):
         read_tum(tmp_path / "none.tum")
+
+
+def test_a_trajectory_comes_with_the_covariances_beside_it(tmp_path):
+    path, table = tmp_path / "poses.tum", tmp_path / "poses.csv"
+    random = np.random.default_rng(0)
+    stamps, poses = 1e9 + 0.1 * np.arange(20), np.cumsum(random.normal(size=(20, 3)), 0)
+    roots = 0.1 * random.normal(size=(20, 3, 3))
+    covs = roots @ np.swapaxes(roots, 1, 2)
+    write_tum(path, stamps, poses)
+    assert read_tum(path).cov_at(stamps[0]) is None
+    write_covariances(table, stamps, poses, covs, np.zeros(20))
+    found = read_tum(path)
+    for i in (0, 7, 19):
+        np.testing.assert_allclose(found.cov_at(stamps[i]), covs[i], rtol=1e-4, atol=1e-7)
+    np.testing.assert_allclose(found.cov_at(stamps[7] + 0.025), (3 * covs[7] + covs[8]) / 4, rtol=1e-4, atol=1e-7)
+    np.testing.assert_allclose(found.cov_at(stamps[-1] + 0.05), covs[-1], rtol=1e-6)
+
+    # What the errors of two poses have in common, nothing or all, the pose between is no less known than that.
+    for common in (-1.0, 0.0, 1.0):
+        shared = common * roots[7] @ roots[8].T
+        between = (covs[7] + covs[8] + shared + shared.T) / 4
+        bound = found.cov_at((stamps[7] + stamps[8]) / 2)
+        assert np.linalg.eigvalsh(bound - between).min() > -1e-6
+
+
+def test_a_table_beside_a_trajectory_that_is_not_of_its_poses(tmp_path):
+    path, table = tmp_path / "poses.tum", tmp_path / "poses.csv"
+    stamps, poses, covs = np.arange(3.0), np.zeros((3, 3)), np.tile(np.eye(3), (3, 1, 1))
+    write_tum(path, stamps, poses)
+    for text in ("", "a,b\n1,2\n", "\udcff"):  # somebody else's file
+        table.write_bytes(text.encode(errors="surrogateescape"))
+        assert read_tum(path).cov_at(0.0) is None
+    for what, told in (
+        ((stamps[:2], poses[:2], covs[:2]), "other poses than those beside it"),
+        ((stamps + 0.1, poses, covs), "other poses than those beside it"),
+        ((stamps, poses + [0, 0, 0.1], covs), "other poses than those beside it"),
+        ((stamps, poses, covs + [[0, 2, 0], [2, 0, 0], [0, 0, 0]]), "holds a covariance that is none"),
+        ((stamps, poses, -covs), "holds a covariance that is none"),
+        ((stamps, poses, covs * np.nan), "holds a covariance that is none"),
+    ):
+        write_covariances(table, *what, np.zeros(len(what[0])), overwrite=True)
+        with pytest.raises(LogError, match=told) as caught:
+            read_tum(path)
+        assert str(caught.value).startswith(str(table))
+    write_covariances(table, stamps, poses, covs, np.zeros(3), overwrite=True)
+    whole = table.read_text()
+    for text in (whole[:-40], whole.replace("1,0,0", "1,x,0", 1), whole.splitlines(keepends=True)[0]):
+        table.write_text(text)
+        with pytest.raises(LogError, match="no table of covariances|other poses"):
+            read_tum(path)
+    # A full turn is no other pose.
+    write_covariances(table, stamps, poses + [0, 0, 2 * np.pi], covs, np.zeros(3), overwrite=True)
+    assert read_tum(path).cov_at(1.0) is not None
 
 
 def test_a_trajectory_says_whose_poses_it_holds(tmp_path):
