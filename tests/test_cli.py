@@ -437,6 +437,14 @@ def test_a_folder_is_not_a_log(refuse, tmp_path):
     )
 
 
+def test_the_help_of_a_command_begins_with_its_own_options(capsys):
+    with pytest.raises(SystemExit):
+        main(["localize", "--help"])
+    told = capsys.readouterr().out
+    order = [told.index(f"--{name}") for name in ("start", "preset", "range-min")]  # its own, the method's, the log's
+    assert order == sorted(order)
+
+
 def test_help_that_nobody_reads_ends_quietly():
     read, write = os.pipe()
     os.close(read)

@@ -13,7 +13,7 @@ import tyro
 from linemap_jax.cli.history import History
 from linemap_jax.cli.logs import SCANS_EXPLAINED, chunks_of_log, mount_of, opened, progress, tell_poses, warn
 from linemap_jax.cli.mapping import map_of_pieces
-from linemap_jax.cli.options import LogOptions, options_of_update
+from linemap_jax.cli.options import LogOptions, options_of_update, own_options_first
 from linemap_jax.cli.output import check_output, make_folder, say
 from linemap_jax.cli.rejections import Rejections
 from linemap_jax.cli.resume import differences, map_to_resume
@@ -33,6 +33,7 @@ COUNTS = ("added", "fused", "merged", "trimmed", "split", "deleted")
 """The counts of a `Report`."""
 
 
+@own_options_first
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Build(LogOptions):
     """Build a map from a log: writes map.json and map.png, and prints a summary."""

@@ -9,10 +9,11 @@ import tyro
 
 from linemap_jax.cli.compilations import keep_compilations
 from linemap_jax.cli.logs import mount_of, opened, warn
-from linemap_jax.cli.options import MOST_SCANS, LogInput, UsageError, check_input
+from linemap_jax.cli.options import MOST_SCANS, LogInput, UsageError, check_input, own_options_first
 from linemap_jax.cli.output import check_output, make_folder, say
 
 
+@own_options_first
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Calibrate(LogInput):
     """Tell the noise of the scanner and of the poses from a log."""

@@ -11,7 +11,7 @@ import tyro
 from linemap_jax.cli.fit import Fit, at_poses_of_map
 from linemap_jax.cli.logs import mount_of, opened, plain_chunks, progress, warn
 from linemap_jax.cli.merge import read_two_maps, warn_of_frames
-from linemap_jax.cli.options import LogInput, UsageError, check_input
+from linemap_jax.cli.options import LogInput, UsageError, check_input, own_options_first
 
 if TYPE_CHECKING:
     from linemap_jax.lab.comparison import Agreement, Change, Comparison, What
@@ -25,6 +25,7 @@ MOST_TOLD = 15
 """Changes of a kind that are told in words; --json tells all."""
 
 
+@own_options_first
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Compare(LogInput):
     """Compare two maps that are in one frame: what has moved, vanished or appeared, and how sure that is."""

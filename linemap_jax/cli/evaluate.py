@@ -11,13 +11,14 @@ import tyro
 from linemap_jax.cli.compilations import keep_compilations
 from linemap_jax.cli.fit import at_poses_of_map, warn_of_fit
 from linemap_jax.cli.logs import SCANS_EXPLAINED, mount_of, opened, plain_chunks, progress, warn
-from linemap_jax.cli.options import LogInput, UsageError, check_input
+from linemap_jax.cli.options import LogInput, UsageError, check_input, own_options_first
 from linemap_jax.cli.worlds import world_from_file
 
 if TYPE_CHECKING:
     from linemap_jax.core.state import LineMap
 
 
+@own_options_first
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Evaluate(LogInput):
     """Score a map: against a true world, or against a log, or both."""

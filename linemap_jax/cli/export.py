@@ -9,7 +9,7 @@ import tyro
 from linemap_jax.cli.compilations import keep_compilations
 from linemap_jax.cli.fit import Fit, at_poses_of_map
 from linemap_jax.cli.logs import mount_of, opened, progress, warn
-from linemap_jax.cli.options import LogInput, UsageError, check_input
+from linemap_jax.cli.options import LogInput, UsageError, check_input, own_options_first
 from linemap_jax.cli.output import check_output, make_folder, say
 
 if TYPE_CHECKING:
@@ -20,6 +20,7 @@ FormatName = Literal["json", "geojson", "svg", "dxf", "nav2", "mcap", "tum", "pn
 """What `--to` offers: the names of `linemap_jax.io.exports.FORMATS`, which is not loaded to print a help text."""
 
 
+@own_options_first
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Export(LogInput):
     """Write a map in another format: for GIS, CAD, ROS 2, nav2, a browser."""

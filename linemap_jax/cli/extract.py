@@ -7,11 +7,12 @@ from typing import Annotated
 import tyro
 
 from linemap_jax.cli.logs import chunks_of_log, opened, progress, warn
-from linemap_jax.cli.options import LogOptions, options_of_update
+from linemap_jax.cli.options import LogOptions, options_of_update, own_options_first
 from linemap_jax.cli.output import say
 from linemap_jax.cli.rejections import Rejections
 
 
+@own_options_first
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Extract(LogOptions):
     """Extract lines and circles scan by scan: one JSON line a scan, in the frame of the sensor."""

@@ -10,7 +10,7 @@ from typing import Any
 import tyro
 
 from linemap_jax.cli.logs import opened, progress
-from linemap_jax.cli.options import LogInput, check_input
+from linemap_jax.cli.options import LogInput, check_input, own_options_first
 
 SHARES = {
     "returns": "returns",
@@ -30,6 +30,7 @@ WHY = {
 """Of the command to go on with, by whether the poses drift."""
 
 
+@own_options_first
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Info(LogInput):
     """Tell what a log holds: scans, ranges, topics, frames, where poses come from."""

@@ -13,7 +13,7 @@ import tyro
 
 from linemap_jax.cli.compilations import cache_folder
 from linemap_jax.cli.logs import chunks_of_log, mount_of_odometry, odometry_of, opened, progress, warn
-from linemap_jax.cli.options import POSE_SIGMA, LogOptions, UsageError, options_of_update
+from linemap_jax.cli.options import POSE_SIGMA, LogOptions, UsageError, options_of_update, own_options_first
 from linemap_jax.cli.output import check_output, make_folder, say
 
 if TYPE_CHECKING:
@@ -29,6 +29,7 @@ GAP_SIGMA = (1.0, 1.0, 0.5)
 """Added to a step over a gap in the log, m m rad: the robot may have been pushed meanwhile."""
 
 
+@own_options_first
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Localize(LogOptions):
     """Find the robot's way through a map, from odometry and scans: writes a trajectory, and covariances beside it.

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import tyro
 
@@ -28,6 +28,19 @@ class UsageError(Exception):
 
 POSE_SIGMA = (0.05, 0.05, 0.01)
 """Of poses for which nothing is stated, m m rad."""
+
+
+CommandT = TypeVar("CommandT")
+
+
+def own_options_first(command: type[CommandT]) -> type[CommandT]:
+    """The command, a dataclass, with its options in the order of its help: its own before those that it inherits."""
+    fields = command.__dataclass_fields__  # pyright: ignore[reportAttributeAccessIssue]
+    order = [name for kind in command.__mro__ for name in vars(kind).get("__annotations__", {}) if name in fields]
+    moved = {name: fields[name] for name in order}
+    fields.clear()
+    fields.update(moved)
+    return command
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -13,7 +13,7 @@ import tyro
 
 from linemap_jax.cli.logs import SCANS_EXPLAINED, chunks_of_log, mount_of_odometry, odometry_of, opened, progress, warn
 from linemap_jax.cli.mapping import map_of_pieces
-from linemap_jax.cli.options import POSE_SIGMA, LogOptions, UsageError, options_of_update
+from linemap_jax.cli.options import POSE_SIGMA, LogOptions, UsageError, options_of_update, own_options_first
 from linemap_jax.cli.output import check_output, make_folder, say
 
 if TYPE_CHECKING:
@@ -28,6 +28,7 @@ DOUBTFUL = 0.4
 """Scans of which fewer points than this share agree with what was seen before are told of."""
 
 
+@own_options_first
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Slam(LogOptions):
     """Build a map and a trajectory from a log with raw odometry: writes map.json, map.png, trajectory.tum and .csv."""
