@@ -33,7 +33,7 @@ CHUNK_RUNS = 256
 """Drives after which the results are written, of all devices together."""
 
 MOST_OF_CPU = 256
-"""Devices that the processors of one machine are taken for, where more are asked for than there are processors."""
+"""Devices that the processors of one machine are taken for at most, where more are asked for than it has."""
 
 PACE = 30.0
 """Seconds from one word about the progress to the next, where it goes into a file."""
@@ -217,7 +217,8 @@ class Trials:
         try:
             return mesh_of_devices(self.devices)
         except ValueError as error:
-            raise UsageError(f"--devices: {error}") from error
+            most = f"; processors stand for at most {MOST_OF_CPU} on each host" if asked > MOST_OF_CPU else ""
+            raise UsageError(f"--devices: {error}{most}") from error
 
     def _connect(self) -> None:
         """Join the other hosts."""
