@@ -999,11 +999,15 @@ def extract(
         kept_points = without_strange_ends(sweep, of_lines, kept_points, thresholds, margin)
     found = []
     for run, points in zip(of_lines, kept_points, strict=True):
-        if _are_enough(len(points), run):
-            line_of_beam[sweep.beam[run]] = len(found)
-            found.append(_line_of_run(sweep, run, points, covariance=covariance, rules=rules, margin=margin))
-        else:
+        if not _are_enough(len(points), run):
             rejected["too_few"] += len(run)
+            continue
+        line = _line_of_run(sweep, run, points, covariance=covariance, rules=rules, margin=margin)
+        if margin.below(float(np.diff(line["extent"])[0]), float(thresholds.min_length)):
+            rejected["too_short"] += len(run)
+            continue
+        line_of_beam[sweep.beam[run]] = len(found)
+        found.append(line)
     lines = Lines(
         anchor=_stack(found, "anchor", (2,)),
         offset=_stack(found, "offset", ()),

@@ -230,14 +230,16 @@ def extract_points(
         few, short = ~chosen, jnp.zeros_like(chosen)
     slots = max(capacity.lines, max_vertices or 0)
     runs, lines_full = select_runs(run.n, ends & chosen & ~few & ~short, slots)
+    fitted = runs if max_vertices is not None else choose_points(points, runs, thresholds, noise, rules)
     lines, jac_line_pose, cov_measurement = measure_lines(
         points,
         pose,
-        runs if max_vertices is not None else choose_points(points, runs, thresholds, noise, rules),
+        fitted,
         noise,
         maximum_likelihood=rules.maximum_likelihood,
         covariance=covariance,
         jacobians=jacobians,
+        min_length=thresholds.min_length if max_vertices is None else 0.0,
     )
     if segmented is not None and max_vertices is not None:
         lines = optimal.lines_of_polyline(lines, segmented, pose)
@@ -259,7 +261,7 @@ def extract_points(
     status = jnp.where(lines_full, int(Status.SCAN_LINES_FULL), 0)
     status |= jnp.where(circles_full, int(Status.SCAN_CIRCLES_FULL), 0)
     in_run = runs.of_point >= 0
-    on_line = in_run & lines.valid[runs.of_point]
+    on_line, left = in_run & lines.valid[runs.of_point], in_run & ~fitted.valid[runs.of_point]
     in_cluster = clusters.of_point >= 0
     modelled = circles.valid[clusters.of_point]
     return Extraction(
@@ -274,8 +276,8 @@ def extract_points(
             gap=breaks[0],
             distance=breaks[1],
             bearing=breaks[2],
-            too_few=points_of(run.n, ends & few) + jnp.sum(in_run & ~on_line, dtype=jnp.int32),
-            too_short=points_of(run.n, ends & ~few & short),
+            too_few=points_of(run.n, ends & few) + jnp.sum(left, dtype=jnp.int32),
+            too_short=points_of(run.n, ends & ~few & short) + jnp.sum(in_run & ~on_line & ~left, dtype=jnp.int32),
             lone=points_of(size, cluster_ends & lone),
             near_line=jnp.sum(in_cluster & ~modelled, dtype=jnp.int32),
         ),

@@ -20,7 +20,7 @@ from linemap_jax.core.propagation import product, propagate, quadratic, square_r
 from linemap_jax.core.runs import Runs
 from linemap_jax.core.segmentation.incremental import Run, gap_gate
 from linemap_jax.core.sensor import Points, cov_point
-from linemap_jax.core.settings import Covariance, Jacobians, Rules, SensorNoise, Thresholds
+from linemap_jax.core.settings import Covariance, Jacobians, Number, Rules, SensorNoise, Thresholds
 from linemap_jax.core.slots import bounded, earliest_true, latest_true, neutral_where_free
 from linemap_jax.core.state import Lines, Pose, pytree, squared
 
@@ -228,6 +228,7 @@ def measure_lines(
     maximum_likelihood: bool,
     covariance: Covariance,
     jacobians: Jacobians,
+    min_length: Number = 0.0,
 ) -> tuple[Lines, Float[Array, "K 2 3"], Float[Array, "K 2 2"]]:
     """The line of each run, with its covariance: sections 4.2.2 to 4.2.5.
 
@@ -244,6 +245,7 @@ def measure_lines(
       maximum_likelihood: go on from the regression by a step of `likelihood`.
       covariance: "exact" or "printed".
       jacobians: "autodiff" or "analytic".
+      min_length: a line that comes out shorter is none, m.
 
     Returns:
       The lines in the world; P, shape `[K, 2, 3]`; M, shape `[K, 2, 2]`, both for (offset, angle).
@@ -265,6 +267,7 @@ def measure_lines(
         jac = jac_line_points(points.position, runs, anchor, jacobians=jacobians)
     offset, angle = line
     ends = _ends(points, runs, anchor, line, noise)
+    extent = line_extent(points.position, ends, anchor, angle)
 
     sigma = jnp.stack([noise.range_sigma, noise.bearing_sigma])
     from_noise = product(jac, points.jac_measurement) * sigma[None, None]
@@ -285,10 +288,10 @@ def measure_lines(
         cov_independent=cov_measurement,
         sqrt_persistent=product(jac_line_pose, square_root(pose.cov)[None]),
         first_angle=angle,
-        extent=line_extent(points.position, ends, anchor, angle),
+        extent=extent,
         var_extent=_var_extent(points, pose, ends, angle, noise),
         times_detected=jnp.ones_like(runs.first),
-        valid=runs.valid,
+        valid=runs.valid & (extent[:, 1] - extent[:, 0] >= min_length),
     )
     lines = dataclasses.replace(lines, valid=lines.valid & bounded(lines))
     measured = lines.valid[:, None, None]

@@ -388,12 +388,17 @@ def test_a_point_that_was_left_out_ends_a_line_only_if_it_lies_on_it(end: int, o
     runs = runs_at(9, (0, 8))
     runs = dataclasses.replace(runs, of_point=jnp.where(fitted, runs.of_point, -1))
     noise = SensorNoise(range_sigma=0.01 / np.cos(bearings[end]), bearing_sigma=0.0)
-    lines, _, _ = measure_lines(
-        points, here, runs, noise, maximum_likelihood=True, covariance="exact", jacobians="analytic"
-    )
+    measure = partial(measure_lines, maximum_likelihood=True, covariance="exact", jacobians="analytic")
+    lines, _, _ = measure(points, here, runs, noise)
     ends = np.stack([lines.begin[0], lines.end[0]])
     y = 10 * np.tan(bearings)
     y[end] *= 1 + off / 10
     outermost = end if on_line else abs(end - 3)
     expected = [y[outermost], y[8]] if end == 0 else [y[0], y[outermost]]
     np.testing.assert_allclose(ends, np.stack([[10.0, 10.0], expected], -1), atol=1e-9)
+    # What is too short by then is none.
+    length = expected[1] - expected[0]
+    for least, is_line in ((length - 1e-6, True), (length + 1e-6, False)):
+        found, by_pose, cov = measure(points, here, runs, noise, min_length=least)
+        assert bool(found.valid[0]) == is_line
+        assert bool(np.any(by_pose)) == bool(np.any(cov)) == is_line
