@@ -1589,13 +1589,15 @@ def beam_cuts(
     dares &= (den > 0) | (not rules.tell_sides)
     height = np.abs(dot(found.lines.normal, apex - found.lines.anchor) - found.lines.offset)
     stretch = np.where(height < EDGE_ON, 0.0, 1 + t.wipe_extension / np.maximum(height, EDGE_ON))
-    reach = np.maximum(sweep.r[i] - margin, np.where(dares, sweep.r[i] * np.append(stretch, 0.0)[label[i]], 0.0))
-    passed = np.zeros(meets.shape, bool)
-    passed[j, i] = r_line < reach
+    through, reached = np.zeros(meets.shape, bool), np.zeros(meets.shape, bool)
+    through[j, i] = r_line < sweep.r[i] - margin
+    reached[j, i] = through[j, i] | (dares & (r_line < sweep.r[i] * np.append(stretch, 0.0)[label[i]]))
 
     neighbours = np.abs(np.diff(sweep.bearing)) < t.gap_beams * sweep.spacing
+    # Between two beams that met different lines nothing is known to be behind either.
+    neighbours = neighbours & (through[:, :-1] | through[:, 1:] | (slot_of_beam[:-1] == slot_of_beam[1:]))
     cuts: Cuts = {}
-    for j, i in np.argwhere(passed[:, :-1] & passed[:, 1:] & neighbours):
+    for j, i in np.argwhere(reached[:, :-1] & reached[:, 1:] & neighbours):
         a, b = sorted((float(s[j, i]), float(s[j, i + 1])))
         cuts.setdefault(int(slots[j]), []).append((a, b))
     return cuts

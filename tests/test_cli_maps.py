@@ -131,6 +131,9 @@ def test_other_settings_are_told() -> None:
     assert differences(before, now) == told
     assert differences(now, now) == ""
     assert differences({"merged": []}, now) == ""
+    mounts = [{"mount": {"x": x, "y": 0.0, "theta": 0.0}} for x in (0.0, 0.18)]
+    assert differences(*mounts) == "mount.x 0.0 (now 0.18)"
+    assert differences({"slam": {}} | mounts[0], mounts[1]) == ""
     assert differences(before | {"rules": PAPER_RULES}, now).endswith(
         "rules.maximum_likelihood False (now True) and 11 more"
     )

@@ -47,11 +47,12 @@ def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     """What settings differ, in words: `preset paper (now default), ...`; empty if none does.
 
     The map goes on with those of now: another drive may well have another noise. A setting that one of the two does not
-    have tells nothing.
+    have tells nothing; nor does the mount of a map of `slam`, whose poses are the laser's.
     """
     from linemap_jax.io.map_file import plain_settings
 
-    old, new = (dict(_flat(plain_settings({k: x[k] for k in COMPARED if k in x}))) for x in (before, now))
+    compared = [name for name in COMPARED if name != "mount" or "slam" not in before]
+    old, new = (dict(_flat(plain_settings({k: x[k] for k in compared if k in x}))) for x in (before, now))
     told = [f"{name} {old[name]} (now {new[name]})" for name in new if name in old and not _alike(old[name], new[name])]
     more = len(told) - MOST_TOLD
     return ", ".join(told[:MOST_TOLD]) + (f" and {more} more" if more > 0 else "")

@@ -17,7 +17,7 @@ from linemap_jax.core.frames import dot, perp, shift_matrix, unit, wrap_angle
 from linemap_jax.core.matching import CircleMatches, compare_lines, with_sign
 from linemap_jax.core.propagation import apply, inverse, product, safe_sqrt, square_root, symmetric
 from linemap_jax.core.settings import Number, PoseError, Rules, Thresholds
-from linemap_jax.core.slots import choose, least, take
+from linemap_jax.core.slots import choose, computed_once, least, take
 from linemap_jax.core.state import Circles, Lines, Pose, pytree, squared
 
 JACOBIAN_ERROR = 0.005
@@ -227,9 +227,15 @@ def _fuse_ends(
     scans at 5 cm of pose error). By default end points that agree within their spread are averaged by their variances;
     an observed end well beyond the old one replaces it, and one well short of it (the rest was hidden) does nothing.
     """
-    # From anchor to anchor: coordinates of the world have fewer digits far from its origin.
-    middle = pieces.anchor - model.anchor + pieces.offset[:, None] * pieces.normal
-    along = dot(model.tangent, middle)[:, None] + dot(model.tangent, pieces.tangent)[:, None] * pieces.extent
+
+    def on_line(rows: tuple[Lines, Lines]) -> Array:
+        """The ends of each piece, along its line."""
+        line, piece = rows
+        # From anchor to anchor: coordinates of the world have fewer digits far from its origin.
+        middle = piece.anchor - line.anchor + piece.offset[:, None] * piece.normal
+        return dot(line.tangent, middle)[:, None] + dot(line.tangent, piece.tangent)[:, None] * piece.extent
+
+    along = computed_once(on_line, (model, pieces))
 
     def outermost(direction: int, old: Array, var_old: Array) -> tuple[Array, Array]:
         """The lower end for direction -1, the upper one for +1, in coordinates in which larger is longer."""

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from linemap_jax.core.frames import dot, wrap_angle
 from linemap_jax.core.propagation import inverse, quadratic
 from linemap_jax.core.settings import PoseError, Rules, Thresholds
-from linemap_jax.core.slots import directed, least, take
+from linemap_jax.core.slots import all_true, computed_once, directed, least, take
 from linemap_jax.core.state import Circles, Lines, pytree, squared
 
 OVERLAP_WEIGHT = 1e-3
@@ -149,8 +149,11 @@ def best_line(
     by_model = jax.vmap(score, (None, 0))
     scores = jax.vmap(by_model, (0, None))(new, directed(model))
     slot, best = least(scores if among is None else jnp.where(among, scores, jnp.inf))
-    chosen: LineComparison = jax.vmap(lambda a, b: compare_lines(a, b, thresholds, pose_error))(new, take(model, slot))
-    return slot, jnp.where(jnp.isfinite(best), chosen.nis, jnp.inf)
+
+    def nis(rows: tuple[Lines, Lines]) -> Float[Array, " l"]:
+        return jax.vmap(lambda a, b: compare_lines(a, b, thresholds, pose_error).nis)(*rows)
+
+    return slot, jnp.where(jnp.isfinite(best), computed_once(nis, (new, take(model, slot))), jnp.inf)
 
 
 def normal_variance(cov: Float[Array, "2 2"], along: Float[Array, "*s"]) -> Float[Array, "*s"]:
@@ -194,7 +197,8 @@ def compare_pieces(new: Lines, thresholds: Thresholds) -> LineComparison:
     def compare(a: Lines, b: Lines) -> LineComparison:
         return compare_lines(a, b, thresholds, "persistent")
 
-    return jax.vmap(jax.vmap(compare, (None, 0)), (0, None))(new, new)
+    lines = directed(new)
+    return jax.vmap(jax.vmap(compare, (None, 0)), (0, None))(lines, lines)
 
 
 def match_lines(
@@ -255,15 +259,16 @@ def group_lines(pair: LineComparison, unmatched: Bool[Array, " L"], thresholds: 
     """
     agree = pair.geometric & (pair.nis < thresholds.match_nis)
     score = jnp.where(agree, pair.nis + OVERLAP_WEIGHT * pair.gap, jnp.inf)
-    index = jnp.arange(unmatched.shape[0])
+    index = jnp.arange(unmatched.shape[0], dtype=jnp.int32)
+    lines = all_true(unmatched, index.shape[0])
 
-    def step(i: Array, leader: Array) -> Array:
+    def step(k: Array, leader: Array) -> Array:
+        i = lines[k]
         candidates = jnp.where(leader == index, score[i], jnp.inf)  # only lines before i lead yet
         best, value = least(candidates[None])
-        mine = jnp.where(jnp.isfinite(value[0]), best[0], i)
-        return leader.at[i].set(jnp.where(unmatched[i], mine, -1))
+        return leader.at[i].set(jnp.where(jnp.isfinite(value[0]), best[0], i).astype(leader.dtype))
 
-    return jax.lax.fori_loop(0, index.shape[0], step, jnp.full(index.shape, -1, index.dtype)).astype(jnp.int32)
+    return jax.lax.fori_loop(0, jnp.sum(unmatched, dtype=jnp.int32), step, jnp.full(index.shape, -1, index.dtype))
 
 
 @pytree

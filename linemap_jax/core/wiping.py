@@ -135,7 +135,8 @@ def passed_through(
     A beam passed through if it ended beyond the line by `wipe_sigmas` of the predicted spread of that distance, which
     holds the range, the line, the pose and the bearing; and in any case by `match_distance`. A beam that met another
     line reaches `wipe_extension` behind that, to wipe noise; but not what was detected more often than the line that it
-    met. A beam never wipes the line that it is a measurement of.
+    met, nor from one line to the next: of a wall that is seen edge-on two beams may meet no more than the walls at its
+    corners. A beam never wipes the line that it is a measurement of.
 
     Args:
       line: one line, no batch axis.
@@ -172,8 +173,10 @@ def passed_through(
 
     on_line = (along > line.extent[0]) & (along < line.extent[1])
     meets = meets & (distance > 0) & on_line & points.valid & line.valid
-    passes = meets & (swath.own != slot) & (passed | behind)
-    gone = swath.joined[:-1] & passes[:-1] & passes[1:]
+    meets = meets & (swath.own != slot)
+    through, reached = meets & passed, meets & (passed | behind)
+    of_one = through[:-1] | through[1:] | (swath.own[:-1] == swath.own[1:])
+    gone = swath.joined[:-1] & reached[:-1] & reached[1:] & of_one
     return jnp.minimum(along[:-1], along[1:]), jnp.maximum(along[:-1], along[1:]), gone
 
 
@@ -453,11 +456,19 @@ def passed_circles(
         met = radius - slack  # a beam that passes the centre by less has met the circle, if it is there
         wide = witness & next_too & (aside - next_aside > 2 * met)
         to_left, to_right = witness & (aside <= met - unsure), witness & (aside >= unsure - met)
-        covered = jnp.any(to_left) & jnp.any(to_right) & (jnp.sum(witness) >= 2)
-        return covered & ~jnp.any(wide | (witness & ~beyond))
+        # Two counts in one sum: each costs a walk over all beams of all circles.
+        witnesses, hidden = _two_sums(witness, wide | (witness & ~beyond))
+        left, right = _two_sums(to_left, to_right)
+        return (left > 0) & (right > 0) & (witnesses >= 2) & (hidden == 0)
 
     to_center, unsure, deep, slack = computed_once(jax.vmap(window), circles.center)
     return circles.valid & jax.vmap(gone)(to_center, unsure, deep, slack, circles.radius)
+
+
+def _two_sums(a: Bool[Array, " N"], b: Bool[Array, " N"]) -> tuple[Int[Array, ""], Int[Array, ""]]:
+    """How often each holds; `N` is less than 32 768."""
+    both = jnp.sum(a.astype(jnp.int32) + (b.astype(jnp.int32) << 16), dtype=jnp.int32)
+    return both & 0xFFFF, both >> 16
 
 
 def circles_inside_triangles(circles: Circles, triangles: Triangles) -> Bool[Array, " C"]:

@@ -341,6 +341,25 @@ def test_a_wall_does_not_wipe_its_own_back() -> None:
 
 
 @pytest.mark.parametrize(
+    ("own", "second_range", "gone"),
+    [((1, 1), 3.0, True), ((1, 2), 3.0, False), ((1, 2), 3.3, True), ((-1, 2), 3.0, False)],
+)
+def test_between_two_beams_that_met_different_lines_nothing_is_behind_either(
+    own: tuple[int, int], second_range: float, gone: bool
+) -> None:
+    """Of a wall that is seen edge-on two beams may meet no more than the walls at its corners."""
+    found = lines_of(([3.0, -3.0], [3.0, 0.0]), ([3.0, 0.0], [3.0, 3.0]), capacity=2)
+    ahead = 45  # the beam at 0 degrees; the one before is at -1
+    ranges = np.where(np.arange(91) == ahead, second_range, WALL)
+    points = points_from_scan(Scan.from_ranges(ranges, BEARINGS), HERE, Mount(), jacobians="analytic")
+    labels = jnp.where(points.index < ahead, 0, 1)
+    swath = swath_jit(points, HERE, labels, found, jnp.array(own), jnp.array([1, 1]), Thresholds())
+    line = jax.tree.map(lambda x: x[0], lines_of(([3.03, -0.08], [3.03, 0.03])))  # met by these two alone
+    which = passed_jit(line, jnp.array(0), swath, HERE.cov, Thresholds(), SensorNoise(), Rules())[2]
+    np.testing.assert_array_equal(points.index[:-1][which], [ahead - 1] if gone else [])
+
+
+@pytest.mark.parametrize(
     ("x", "radius", "gone"),
     # Beams are 3.5 cm apart at 2 m: a pole of 5 cm cannot stand between two of them, one of 1 cm can. One of 4 cm
     # cannot either, but beams that are off by 3 mrad each may have gone past it: 4 - 2 * 0.6 cm is less than 3.5.
