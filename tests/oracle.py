@@ -641,6 +641,32 @@ def without_strange_ends(
     return result
 
 
+def without_near_ends(
+    sweep: Sweep, runs: list[list[int]], kept: list[list[int]], thresholds: Any, margin: Margin
+) -> list[list[int]]:
+    """The points of each run without those near its ends; without its two outermost ones, or with all, if few.
+
+    Args:
+      sweep: the valid beams.
+      runs: those that are lines, each a list of positions in the sweep.
+      kept: of each run the points that have not been left out before.
+      thresholds: of criterion 2.
+      margin: notes how clear the decisions were.
+    """
+    result = []
+    for run, mine in zip(runs, kept, strict=True):
+        inner = []
+        for i in mine:
+            gate = float(thresholds.line_sigmas) * math.hypot(sweep.sr, sweep.r[i] * sweep.sa)
+            gate = max(float(thresholds.line_distance), gate)
+            far = [not margin.below(math.dist(sweep.o[i], sweep.o[end]), gate) for end in (run[0], run[-1])]
+            if all(far) and i not in (*run[:2], *run[-2:]):
+                inner.append(i)
+        without_two = [i for i in mine if i not in (run[0], run[-1])]
+        result.append(next((some for some in (inner, without_two) if _are_enough(len(some), run)), mine))
+    return result
+
+
 def _are_enough(count: int, run: list[int]) -> bool:
     """Whether so many of the points of a run make a line."""
     return count >= 3 and 3 * count >= len(run)
@@ -714,11 +740,17 @@ def _line_of_run(
     normal = np.array([math.cos(angle), math.sin(angle)])
     tangent = np.array([-normal[1], normal[0]])
     ends = []
-    for of_run, of_fit in ((run[0], kept[0]), (run[-1], kept[-1])):
-        cos2 = float(normal @ sweep.u[of_run]) ** 2
-        sigma = math.sqrt(sweep.sr**2 * cos2 + (sweep.r[of_run] * sweep.sa) ** 2 * (1 - cos2))
-        beside = abs(float(normal @ (sweep.o[of_run] - here)) - offset)
-        ends.append(of_fit if margin.below(UNSURE_SIGMAS * sigma, beside) else of_run)
+    for inward, of_fit in ((run, kept[0]), (run[::-1], kept[-1])):
+        # The outermost that lies on the line, of those which are farther out than what was fitted.
+        for k in inward[: min(4, inward.index(of_fit))]:
+            cos2 = float(normal @ sweep.u[k]) ** 2
+            sigma = math.sqrt(sweep.sr**2 * cos2 + (sweep.r[k] * sweep.sa) ** 2 * (1 - cos2))
+            beside = abs(float(normal @ (sweep.o[k] - here)) - offset)
+            if not margin.below(UNSURE_SIGMAS * sigma, beside):
+                ends.append(k)
+                break
+        else:
+            ends.append(of_fit)
     extent = np.array([tangent @ (sweep.o[k] - here) for k in ends])
 
     f, g = jac_point_pose(o), jac_point_measurement(r, u)
@@ -997,6 +1029,8 @@ def extract(
         kept_points = without_sparse(sweep, of_lines, kept_points, thresholds, margin)
     if rules.check_ends:
         kept_points = without_strange_ends(sweep, of_lines, kept_points, thresholds, margin)
+    if rules.leave_out_ends:
+        kept_points = without_near_ends(sweep, of_lines, kept_points, thresholds, margin)
     found = []
     for run, points in zip(of_lines, kept_points, strict=True):
         if not _are_enough(len(points), run):

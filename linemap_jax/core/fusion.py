@@ -235,7 +235,7 @@ def _fuse_ends(
         middle = piece.anchor - line.anchor + piece.offset[:, None] * piece.normal
         return dot(line.tangent, middle)[:, None] + dot(line.tangent, piece.tangent)[:, None] * piece.extent
 
-    along = computed_once(on_line, (model, pieces))
+    along: Array = computed_once(on_line, (model, pieces))
 
     def outermost(direction: int, old: Array, var_old: Array) -> tuple[Array, Array]:
         """The lower end for direction -1, the upper one for +1, in coordinates in which larger is longer."""

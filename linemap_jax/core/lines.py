@@ -31,6 +31,8 @@ UNSURE_SIGMAS = 3.0
 LEAST_SHARE = 1 / 3
 """Of the points of a run must be left for the fit. A line through few of them, chosen by the line through all, would
 err by far more than it says."""
+INWARD = 4
+"""So many points of a run are asked from either end whether they may end the line."""
 GRAZING = 0.01
 """Least cosine of an incidence that is reckoned with."""
 
@@ -301,20 +303,29 @@ def measure_lines(
 def _ends(
     points: Points, runs: Runs, anchor: Float[Array, "K 2"], line: Float[Array, "2 K"], noise: SensorNoise
 ) -> Int[Array, "K 2"]:
-    """Which points end each line: the first and last of its run where they lie on it, else the outermost of the fit.
+    """Which points end each line: the outermost of the fit, or one farther out that was left out and lies on the line.
 
     Far away a run may go on round a corner. The points there are left out of the fit, and the last of them may lie
-    decimetres beside the line; what is on the line by `UNSURE_SIGMAS` may end it, fitted or not.
+    decimetres beside the line. From either end of the run `INWARD` points are looked at; what is on the line by
+    `UNSURE_SIGMAS` may end it.
     """
     offset, angle = line
-    normal = jnp.stack([jnp.cos(angle), jnp.sin(angle)], -1)[:, None]
+    normal = jnp.stack([jnp.cos(angle), jnp.sin(angle)], -1)[:, None, None]
     index = jnp.arange(runs.of_point.shape[0], dtype=jnp.int32)
-    mine = runs.of_point[None] == jnp.arange(runs.valid.shape[0])[:, None]
-    of_fit = [jnp.min(jnp.where(mine, index, index.shape[0] - 1), -1), jnp.max(jnp.where(mine, index, 0), -1)]
-    of_run = jnp.stack([runs.first, runs.last], -1)
-    across = dot(normal, points.position[of_run] - anchor[:, None]) - offset[:, None]
-    variance = _var_across(dot(normal, points.beam[of_run]) ** 2, points.range[of_run], noise)
-    return jnp.where(across**2 <= UNSURE_SIGMAS**2 * variance, of_run, jnp.stack(of_fit, -1))
+    mine = runs.of_point[None] == jnp.arange(runs.valid.shape[0], dtype=jnp.int32)[:, None]
+    first = jnp.min(jnp.where(mine, index[None], index.shape[0] - 1), -1)
+    last = jnp.max(jnp.where(mine, index[None], 0), -1)
+    inward = jnp.arange(INWARD, dtype=jnp.int32)[None]
+    farther = jnp.stack([runs.first[:, None] + inward, runs.last[:, None] - inward], 1)  # [K, 2, INWARD]
+    farther = jnp.clip(farther, 0, index.shape[0] - 1)
+    across = dot(normal, points.position[farther] - anchor[:, None, None]) - offset[:, None, None]
+    variance = _var_across(dot(normal, points.beam[farther]) ** 2, points.range[farther], noise)
+    on_line = across**2 <= UNSURE_SIGMAS**2 * variance
+    outside = jnp.stack([farther[:, 0] < first[:, None], farther[:, 1] > last[:, None]], 1)
+    ends = jnp.stack([first, last], -1)
+    for i in reversed(range(INWARD)):
+        ends = jnp.where(on_line[..., i] & outside[..., i], farther[..., i], ends)
+    return ends
 
 
 def line_extent(
@@ -336,7 +347,7 @@ def line_extent(
 
 
 def choose_points(points: Points, runs: Runs, thresholds: Thresholds, noise: SensorNoise, rules: Rules) -> Runs:
-    """The runs with the points that the fit should use, by `leave_out_corners`, `leave_out_sparse` and `check_ends`.
+    """The runs with the points that the fit should use, by the rules `leave_out_...` and `check_ends`.
 
     A choice that depends on the noise of the points it makes biases what is fitted to them. So it is made by where the
     line of the run, and the lines beside it, say that the points are; or by a gate that noise alone hardly ever passes.
@@ -351,7 +362,7 @@ def choose_points(points: Points, runs: Runs, thresholds: Thresholds, noise: Sen
     Returns:
       The runs; not valid where less than a third of the points, or fewer than three, are left.
     """
-    if not (rules.leave_out_corners or rules.leave_out_sparse or rules.check_ends):
+    if not (rules.leave_out_corners or rules.leave_out_sparse or rules.check_ends or rules.leave_out_ends):
         return runs
     fit = regress(points.position, runs)
     length2 = jnp.maximum(dot(fit.direction, fit.direction), 1)
@@ -363,8 +374,10 @@ def choose_points(points: Points, runs: Runs, thresholds: Thresholds, noise: Sen
         kept &= ~_sparse(points, runs.spread(normal), thresholds, noise)
     if rules.check_ends:
         kept &= ~_strange_ends(points, runs, fit, normal, thresholds, noise)
+    if rules.leave_out_ends:
+        kept &= ~_near_ends(points, runs, kept, fit.count, thresholds, noise)
     count = runs.sum(kept.astype(fit.count.dtype))
-    valid = runs.valid & (count >= MIN_POINTS) & (count >= LEAST_SHARE * fit.count)
+    valid = runs.valid & _enough(count, fit.count)
     return dataclasses.replace(runs, of_point=jnp.where(kept, runs.of_point, -1), valid=valid)
 
 
@@ -444,6 +457,41 @@ def _strange_ends(
         out = runs.valid & (dot(normal, from_middle) ** 2 > gate)
         strange = strange.at[jnp.where(out, at, strange.shape[0])].set(True, mode="drop")
     return strange
+
+
+def _near_ends(
+    points: Points,
+    runs: Runs,
+    kept: Bool[Array, " N"],
+    size: Float[Array, " K"],
+    thresholds: Thresholds,
+    noise: SensorNoise,
+) -> Bool[Array, " N"]:
+    """The points nearest to the ends of the runs, where enough are left without them.
+
+    Past an end of a wall criterion 2 lets points of what stands across it pass, until they are as far away as it
+    reaches. One scan hardly shows it, but fifty scans from one side all err alike. So whoever they are, what is as near
+    as that to the first or last point of a run is left out, and two points at least; where too few are left then, the
+    first and the last one; and none where these are needed. Who decides by residuals keeps those that noise has moved
+    to the line.
+    """
+    index = jnp.arange(kept.shape[0], dtype=jnp.int32)
+    in_run = runs.of_point >= 0
+    ends = runs.spread(jnp.concatenate([points.position[runs.first], points.position[runs.last]], -1))
+    from_end = jnp.minimum(index - runs.first[runs.of_point], runs.last[runs.of_point] - index)
+    reach2 = thresholds.line_sigmas**2 * (noise.range_sigma**2 + (points.range * noise.bearing_sigma) ** 2)
+    reach2 = jnp.maximum(reach2, thresholds.line_distance**2)
+    steps = points.position - ends[:, :2], points.position - ends[:, 2:]
+    near = in_run & ((from_end < 2) | (dot(steps[0], steps[0]) < reach2) | (dot(steps[1], steps[1]) < reach2))
+    outermost = in_run & (from_end < 1)
+    left = runs.sum(jnp.stack([kept & ~near, kept & ~outermost], -1).astype(size.dtype))
+    many, some = (runs.spread(_enough(left[:, i], size)) for i in (0, 1))
+    return jnp.where(many, near, some & outermost)
+
+
+def _enough(count: Float[Array, " K"], size: Float[Array, " K"]) -> Bool[Array, " K"]:
+    """Whether so many of the points of runs of some size make a line."""
+    return (count >= MIN_POINTS) & (count >= LEAST_SHARE * size)
 
 
 def _var_across(cosine2: Float[Array, "*s"], range_: Float[Array, "*s"], noise: SensorNoise) -> Float[Array, "*s"]:

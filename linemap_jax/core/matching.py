@@ -153,7 +153,8 @@ def best_line(
     def nis(rows: tuple[Lines, Lines]) -> Float[Array, " l"]:
         return jax.vmap(lambda a, b: compare_lines(a, b, thresholds, pose_error).nis)(*rows)
 
-    return slot, jnp.where(jnp.isfinite(best), computed_once(nis, (new, take(model, slot))), jnp.inf)
+    chosen: Array = computed_once(nis, (new, take(model, slot)))
+    return slot, jnp.where(jnp.isfinite(best), chosen, jnp.inf)
 
 
 def normal_variance(cov: Float[Array, "2 2"], along: Float[Array, "*s"]) -> Float[Array, "*s"]:

@@ -173,6 +173,9 @@ class Rules:
     check_ends: bool = True
     """The first and last point of a run take no part in the fit where criterion 2 does not hold between them and the
     line of the others: the first three points of a run make its line, whatever they are."""
+    leave_out_ends: bool = True
+    """The points nearest to the ends of a run take no part in the fit, as far as criterion 2 reaches and two at least,
+    where enough are left: of what stands across, as the end face of a partition does, points pass the gate."""
     fit_circles: bool = True
     """Fit a circle to a cluster where there are points enough. Eqs. (18)-(20) describe the visible arc: a centre that
     lies before the pole's and moves with the viewpoint."""

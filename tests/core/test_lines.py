@@ -317,7 +317,8 @@ def test_a_line_that_began_on_the_wall_beside_leaves_its_points_out(first: int, 
     bearings = np.radians(np.arange(-20.0, 21.0))
     scan = Scan.from_ranges(3 / (np.cos(bearings) + np.abs(np.sin(bearings))), bearings)
     points = points_from_scan(scan, Pose(mean=jnp.zeros(3), cov=jnp.zeros((3, 3))), Mount(), jacobians="analytic")
-    noise, rules = SensorNoise(range_sigma=0.02, bearing_sigma=0.0), Rules(leave_out_sparse=False, check_ends=False)
+    noise = SensorNoise(range_sigma=0.02, bearing_sigma=0.0)
+    rules = Rules(leave_out_sparse=False, check_ends=False, leave_out_ends=False)
     choose = jax.jit(choose_points, static_argnames="rules")
     found = choose(points, runs_at(41, (0, first - 1), (first, last)), Thresholds(), noise, rules=rules)
     np.testing.assert_array_equal(np.flatnonzero(np.asarray(found.of_point) == 1), range(keeps_from, last + 1))
@@ -330,7 +331,8 @@ def test_points_that_noise_may_have_brought_from_the_wall_beside_are_left_out() 
     scan = Scan.from_ranges(3 / (np.cos(bearings) + np.abs(np.sin(bearings))), bearings)
     here = Pose(mean=jnp.zeros(3), cov=jnp.zeros((3, 3)))
     points = points_from_scan(scan, here, Mount(), jacobians="analytic")
-    noise, rules = SensorNoise(range_sigma=0.05, bearing_sigma=0.0), Rules(leave_out_sparse=False)
+    noise = SensorNoise(range_sigma=0.05, bearing_sigma=0.0)
+    rules = Rules(leave_out_sparse=False, leave_out_ends=False)
     choose = jax.jit(choose_points, static_argnames="rules")
     kept = choose(points, runs_at(41, (0, 20), (21, 40)), Thresholds(), noise, rules=rules)
     x, y = np.asarray(points.position).T
@@ -352,9 +354,8 @@ def test_a_point_at_the_end_that_the_others_disagree_with_is_left_out(moved: int
     points = points_from_scan(Scan.from_ranges(ranges, bearings), here, Mount(), jacobians="analytic")
     sigma = 0.012
     choose = jax.jit(choose_points, static_argnames="rules")
-    found = choose(
-        points, runs_at(7, (0, 6)), Thresholds(), SensorNoise(range_sigma=sigma, bearing_sigma=0.0), rules=Rules()
-    )
+    noise = SensorNoise(range_sigma=sigma, bearing_sigma=0.0)
+    found = choose(points, runs_at(7, (0, 6)), Thresholds(), noise, rules=Rules(leave_out_ends=False))
     others = np.delete(np.arange(7), moved or 0)
     u = 10 * np.tan(bearings)
     predicted = sigma * np.sqrt(
@@ -375,6 +376,46 @@ def test_three_points_of_two_walls_are_no_line() -> None:
         assert bool(found.lines.valid[0]) == a_line
 
 
+@pytest.mark.parametrize(
+    ("count", "left_out"),
+    [
+        (4, []),  # three would not be left
+        (6, [0, 5]),  # three would not be left without the outermost two
+        (7, [0, 1, 5, 6]),  # of 17 cm between points, two at each end
+        (61, [*range(6), *range(55, 61)]),  # of 1.7 cm, those within 10 cm, which are 5 sigma
+    ],
+)
+def test_points_near_the_ends_are_left_out_where_enough_are_left(count: int, left_out: list[int]) -> None:
+    """A wall 10 m ahead, seen from -3 to 3 degrees at most."""
+    spacing = 1.0 if count < 10 else 0.1
+    bearings = np.radians(spacing * (np.arange(count) - (count - 1) / 2))
+    here = Pose(mean=jnp.zeros(3), cov=jnp.zeros((3, 3)))
+    points = points_from_scan(Scan.from_ranges(10 / np.cos(bearings), bearings), here, Mount(), jacobians="analytic")
+    noise = SensorNoise(range_sigma=0.02, bearing_sigma=0.0)
+    choose = jax.jit(choose_points, static_argnames="rules")
+    rules = Rules(leave_out_sparse=False)
+    found = choose(points, runs_at(count, (0, count - 1)), Thresholds(), noise, rules=rules)
+    assert found.valid[0]
+    np.testing.assert_array_equal(np.flatnonzero(np.asarray(found.of_point) < 0), left_out)
+
+
+def test_the_end_face_of_a_partition_turns_no_line() -> None:
+    """Seen from one side fifty scans would all err alike: 10 cm that stand across a wall, with 2 cm of noise."""
+    bearings = np.radians(np.arange(-60.0, -20.0, 0.5))
+    y = 2 * np.tan(bearings)
+    to_end = -1 / np.sin(bearings)  # the face runs to (2, -1) m, and the end face on to (2.1, -1)
+    on_end = (y > -1) & (to_end * np.cos(bearings) < 2.1)
+    ranges = np.where((y > -2.2) & (y < -1), 2 / np.cos(bearings), np.where(on_end, to_end, np.nan))
+    assert on_end.sum() == 3
+    here, noise = Pose(mean=jnp.zeros(3), cov=jnp.zeros((3, 3))), SensorNoise(range_sigma=0.02, bearing_sigma=0.0)
+    errors = []
+    for rule in (False, True):
+        found = extract(Scan.from_ranges(ranges, bearings), here, noise=noise, rules=Rules(leave_out_ends=rule))
+        assert int(found.lines.valid.sum()) == 1
+        errors.append(abs(float(found.lines.angle[0])) / float(np.sqrt(found.lines.cov[0, 1, 1])))
+    assert errors[1] < 0.01 < 1 < errors[0]
+
+
 @pytest.mark.parametrize("end", [0, 8])
 @pytest.mark.parametrize(("off", "on_line"), [(0.0, True), (0.029, True), (0.031, False)])
 def test_a_point_that_was_left_out_ends_a_line_only_if_it_lies_on_it(end: int, off: float, on_line: bool) -> None:
@@ -393,7 +434,7 @@ def test_a_point_that_was_left_out_ends_a_line_only_if_it_lies_on_it(end: int, o
     ends = np.stack([lines.begin[0], lines.end[0]])
     y = 10 * np.tan(bearings)
     y[end] *= 1 + off / 10
-    outermost = end if on_line else abs(end - 3)
+    outermost = end if on_line else abs(end - 1)  # the next one lies on the line, fitted or not
     expected = [y[outermost], y[8]] if end == 0 else [y[0], y[outermost]]
     np.testing.assert_allclose(ends, np.stack([[10.0, 10.0], expected], -1), atol=1e-9)
     # What is too short by then is none.

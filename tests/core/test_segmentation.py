@@ -104,7 +104,8 @@ def receding(shift: np.ndarray) -> np.ndarray:
 def test_points_that_noise_may_have_parted_take_no_part_in_the_fit() -> None:
     last = np.arange(N) == N - 1
     for rule in (True, False):
-        clean, moved = (extracted(receding(0.02 * last * on), leave_out_sparse=rule) for on in (0, 1))
+        rules = {"leave_out_sparse": rule, "leave_out_ends": False}
+        clean, moved = (extracted(receding(0.02 * last * on), **rules) for on in (0, 1))
         assert beams(clean, 0) == beams(moved, 0) == list(range(N))  # of the run they are
         assert (clean.lines.angle[0] == moved.lines.angle[0]) == rule
 
@@ -135,7 +136,8 @@ def test_criterion_2_without_giving_back() -> None:
 
 def test_a_point_given_back_keeps_bad_points_out_of_the_fit() -> None:
     wide = Thresholds(line_distance=0.25, line_sigmas=0.0)
-    fits = [extracted(corner(30), wide, give_back_point=rule, leave_out_corners=False) for rule in (True, False)]
+    rules = {"leave_out_corners": False, "leave_out_ends": False}
+    fits = [extracted(corner(30), wide, give_back_point=rule, **rules) for rule in (True, False)]
     errors = [np.abs(np.asarray(found.lines.angle[0])) for found in fits]
     lengths = [len(beams(found, 0)) for found in fits]
     assert lengths[0] == lengths[1] - 1
