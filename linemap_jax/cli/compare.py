@@ -153,7 +153,8 @@ def _told(change: "Change") -> str:
         what = f"circle of {change.radius:.2f} m at ({x:.2f}, {y:.2f})"
     if change.shift is not None and change.sigma is not None:
         turn = "" if change.turn is None else f", turned {math.degrees(change.turn):.1f} degrees"
-        return f"{what}: by {math.hypot(*change.shift):.2f} ± {change.sigma:.2f} m{turn} (p = {change.p:.1g})"
+        sure = f"p = {change.p:.1g}" if change.p else "p < 1e-300"
+        return f"{what}: by {math.hypot(*change.shift):.3f} ± {change.sigma:.3f} m{turn} ({sure})"
     what += f", detected {change.times_detected} times"
     if change.passed is None or change.met is None:
         return what
