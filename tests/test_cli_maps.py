@@ -239,7 +239,7 @@ def test_maps_are_compared(built: Path, run: Any) -> None:
         assert change["passed"] + change["met"] >= 0
     status, out, _ = run("compare", *maps)
     assert status == 0
-    assert re.search(r"moved: \d lines or pieces of lines, 0 circles\n  line of .* by 0\.\d\d ± 0\.\d\d m", out)
+    assert re.search(r"moved: \d lines or pieces of lines, 0 circles\n  line of .* by 0\.\d{3} ± 0\.\d{3} m", out)
     assert json.loads(run("compare", maps[0], maps[0], "--json")[1])["moved"] == []
 
 
