@@ -20,6 +20,7 @@ from linemap_jax.core.settings import Mount, SensorNoise
 from linemap_jax.core.state import Circles, Lines, Pose, Scan, empty_circles, empty_lines
 from linemap_jax.core.wiping import (
     Triangles,
+    _two_sums,
     circles_inside_triangles,
     inside_triangles,
     may_have_passed,
@@ -378,6 +379,13 @@ def test_circles_that_beams_passed(x: float, radius: float, gone: bool) -> None:
     swath = swath_jit(points, HERE, jnp.zeros(91, jnp.int32), found, jnp.array([0]), jnp.array([1]), Thresholds())
     circles = circle_at(x, 0.2, radius)
     assert bool(passed_circles(circles, swath, HERE.cov, Thresholds(), SensorNoise())[0]) == gone
+
+
+@pytest.mark.parametrize("n", [1000, (1 << 15) - 1, 1 << 15])
+def test_two_counts_in_one_sum(n: int) -> None:
+    index = jnp.arange(n)
+    for a, b in ((index < 0, index >= 0), (index >= 0, index < 0), (index >= 0, index >= 0), (index < 7, index < 9)):
+        assert [int(x) for x in _two_sums(a, b)] == [int(a.sum()), int(b.sum())]
 
 
 def test_a_circle_stays_where_it_may_stand_between_beams_or_beside_them() -> None:
