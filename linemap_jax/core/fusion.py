@@ -17,7 +17,7 @@ from linemap_jax.core.frames import dot, perp, shift_matrix, unit, wrap_angle
 from linemap_jax.core.matching import CircleMatches, compare_lines, with_sign
 from linemap_jax.core.propagation import apply, inverse, product, safe_sqrt, square_root, symmetric
 from linemap_jax.core.settings import Number, PoseError, Rules, Thresholds
-from linemap_jax.core.slots import choose, computed_once, least, take
+from linemap_jax.core.slots import choose, computed_once, first_true, least, put, take
 from linemap_jax.core.state import Circles, Lines, Pose, pytree, squared
 
 JACOBIAN_ERROR = 0.005
@@ -280,56 +280,50 @@ def fuse_circles(model: Circles, new: Circles, matches: CircleMatches, rules: Ru
     Returns:
       The circles of the map, those that were matched improved.
     """
-    k = model.valid.shape[0]
-    into = jnp.where(matches.slot < 0, k, matches.slot)
-    count = jax.ops.segment_sum(jnp.ones_like(into), into, k)
-    touched = count > 0
-    n = jnp.maximum(count, 1).astype(model.radius.dtype)
-    as_vector = jnp.concatenate([new.center, new.radius[:, None]], -1)
-    old = jnp.concatenate([model.center, model.radius[:, None]], -1)
-    mean = jax.ops.segment_sum(as_vector, into, k) / n[:, None]
-    times = model.times_detected
-    times_new = jnp.maximum(jax.ops.segment_max(new.times_detected, into, k), 1)
-    errors = _errors(model)
+    matched = matches.slot >= 0
+    together = (matches.slot[:, None] == matches.slot[None]) & matched[:, None]
+    # The sum over those that go together, and a mean that is one of a single one where there are none
+    count = jnp.maximum(jnp.sum(together, -1), 1).astype(new.radius.dtype)
+    mine = take(model, matches.slot)
+    old, seen = (jnp.concatenate([x.center, x.radius[:, None]], -1) for x in (mine, new))
+    mean = jnp.sum(jnp.where(together[..., None], seen[None], 0), 1) / count[:, None]
+    times = mine.times_detected
+    times_new = jnp.max(jnp.where(together, new.times_detected[None], 1), -1)
+    errors = _errors(mine)
 
     if not rules.weigh_circles:
-        fused, fitted = (old + mean) / 2, model.fitted
+        fused, fitted = (old + mean) / 2, mine.fitted
     else:
-        weight = times_new.astype(n.dtype) / (times + times_new).astype(n.dtype)
+        weight = times_new.astype(count.dtype) / (times + times_new).astype(count.dtype)
         running = old + weight[:, None] * (mean - old)
         # The nearest fitted one of those that match
-        distance = jnp.where(new.fitted, matches.distance, jnp.inf)
-        nearest = jax.ops.segment_min(distance, into, k)
-        at = jnp.maximum(matches.slot, 0)
-        chosen = new.fitted & (matches.slot >= 0) & (distance == nearest[at])
-        index = jnp.where(chosen, jnp.arange(into.shape[0]), into.shape[0])
-        which = jnp.minimum(jax.ops.segment_min(index, into, k), into.shape[0] - 1)
-        has_fit = jnp.isfinite(nearest) & touched
-        fit = take(new, which)
-        seen = as_vector[which]
+        which, nearest = least(jnp.where(together & new.fitted[None], matches.distance[None], jnp.inf))
+        has_fit = jnp.isfinite(nearest)
+        seen, errors_seen = seen[which], _errors(take(new, which))
 
-        both = (has_fit & model.fitted)[:, None, None]
-        errors_seen = _errors(fit)
+        both = (has_fit & mine.fitted)[:, None, None]
         alike = _at_radius(errors_seen, seen[:, 2], old[:, 2], both)
         gain, joint = combine(_or_neutral(errors, both), _or_neutral(alike, both), pose_error)
 
-        fused = jnp.where(model.fitted[:, None], old, running)
+        fused = jnp.where(mine.fitted[:, None], old, running)
         fused = jnp.where(has_fit[:, None], seen, fused)
         fused = jnp.where(both[..., 0], old + apply(gain, seen - old), fused)
         joint = _at_radius(joint, old[:, 2], fused[:, 2], both)
         errors = choose(both[:, 0, 0], joint, choose(has_fit, errors_seen, errors))
-        fitted = model.fitted | has_fit
+        fitted = mine.fitted | has_fit
 
-    at = touched[:, None, None]
-    return dataclasses.replace(
-        model,
-        center=jnp.where(touched[:, None], fused[:, :2], model.center),
-        radius=jnp.where(touched, fused[:, 2], model.radius),
-        cov_independent=jnp.where(at, errors.cov_independent, model.cov_independent),
-        sqrt_persistent=jnp.where(at, errors.sqrt_persistent, model.sqrt_persistent),
-        fitted=jnp.where(touched, fitted, model.fitted),
-        times_detected=times + jnp.where(touched, times_new, 0),
+    improved = dataclasses.replace(
+        mine,
+        center=fused[:, :2],
+        radius=fused[:, 2],
+        cov_independent=errors.cov_independent,
+        sqrt_persistent=errors.sqrt_persistent,
+        fitted=fitted,
+        times_detected=times + times_new,
     )
+    # All that match one circle have the same result; the first one writes it.
+    first = matched & (jax.vmap(first_true)(together) == jnp.arange(matched.shape[0]))
+    return put(model, jnp.where(first, matches.slot, -1), improved)
 
 
 def _at_radius(

@@ -447,22 +447,30 @@ def passed_circles(
         unsure, deep, slack = (thresholds.wipe_sigmas * sigma for sigma in (lateral, depth, slack))
         return to_center, unsure, deep, slack
 
-    def gone(to_center: Array, unsure: Array, deep: Array, slack: Array, radius: Array) -> Array:
+    def unhindered(to_center: Array, unsure: Array, deep: Array, slack: Array, radius: Array) -> Array:
+        """Whether all beams through the window end beyond it, and there are two of them."""
+        along, aside = dot(beams, to_center[None]), _cross(beams, to_center[None])
+        witness = swath.points.valid & (jnp.abs(aside) < radius + unsure) & (along > 0)
+        beyond = swath.points.range > along + radius + deep
+        # Two counts in one sum: each costs a walk over all beams of all circles.
+        witnesses, stopped = _two_sums(witness, witness & ~beyond)
+        return (witnesses >= 2) & (stopped == 0)
+
+    def covered(to_center: Array, unsure: Array, deep: Array, slack: Array, radius: Array) -> Array:
+        """Whether no two neighbours of these beams leave room for the circle between them, nor the last and the rim."""
         along, next_along = dot(beams, to_center[None]), dot(next_beams, to_center[None])
         aside, next_aside = _cross(beams, to_center[None]), _cross(next_beams, to_center[None])
         witness = swath.points.valid & (jnp.abs(aside) < radius + unsure) & (along > 0)
         next_too = follows & (jnp.abs(next_aside) < radius + unsure) & (next_along > 0)
-        beyond = swath.points.range > along + radius + deep
         met = radius - slack  # a beam that passes the centre by less has met the circle, if it is there
         wide = witness & next_too & (aside - next_aside > 2 * met)
         to_left, to_right = witness & (aside <= met - unsure), witness & (aside >= unsure - met)
-        # Two counts in one sum: each costs a walk over all beams of all circles.
-        witnesses, hidden = _two_sums(witness, wide | (witness & ~beyond))
-        left, right = _two_sums(to_left, to_right)
-        return (left > 0) & (right > 0) & (witnesses >= 2) & (hidden == 0)
+        return jnp.any(to_left) & jnp.any(to_right) & ~jnp.any(wide)
 
-    to_center, unsure, deep, slack = computed_once(jax.vmap(window), circles.center)
-    return circles.valid & jax.vmap(gone)(to_center, unsure, deep, slack, circles.radius)
+    windows = (*computed_once(jax.vmap(window), circles.center), circles.radius)
+    passed = circles.valid & jax.vmap(unhindered)(*windows)
+    # Rarely is there any: of a scan that meets the circles that it can see, no second look at all beams is taken.
+    return passed & jax.lax.cond(jnp.any(passed), jax.vmap(covered), lambda *_: jnp.zeros_like(passed), *windows)
 
 
 def _two_sums(a: Bool[Array, " N"], b: Bool[Array, " N"]) -> tuple[Int[Array, ""], Int[Array, ""]]:
