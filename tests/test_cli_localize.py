@@ -10,7 +10,8 @@ import pytest
 from maps import lines_between, poles_at
 
 from linemap_jax.cli import main
-from linemap_jax.cli.localize import Localize, _noise_of, _states_noise
+from linemap_jax.cli.localize import Localize
+from linemap_jax.cli.noise import noise_of_map, states_noise
 from linemap_jax.core.settings import SensorNoise
 from linemap_jax.core.state import LineMap
 from linemap_jax.io.carmen_writer import write_carmen
@@ -123,20 +124,20 @@ def test_where_it_begins_is_told(room: dict[str, Any], tmp_path: Path, capsys: A
 def test_noise_that_is_not_stated_is_the_maps(tmp_path: Path) -> None:
     log, out, config = Path("a.log"), Path("a.tum"), tmp_path / "noise.toml"
     command = Localize(map=Path("map.json"), log=log, output=out)
-    assert not _states_noise(command)
+    assert not states_noise(command)
     config.write_text("[thresholds]\nmin_length = 0.3\n")
-    assert not _states_noise(dataclasses.replace(command, config=config))
+    assert not states_noise(dataclasses.replace(command, config=config))
     config.write_text("[noise]\nrange_sigma = 0.03\n")
     for stated in ({"config": config}, {"scanner": "pls"}, {"range_sigma": 0.01}, {"bearing_sigma": 0.0}):
-        assert _states_noise(dataclasses.replace(command, **stated))
+        assert states_noise(dataclasses.replace(command, **stated))
 
     one, other = ({"noise": {"range_sigma": sigma, "bearing_sigma": 0.002}} for sigma in (0.01, 0.02))
-    assert _noise_of(one) == SensorNoise(range_sigma=0.01, bearing_sigma=0.002)
-    assert _noise_of({"merged": [one, {"merged": [one, one]}]}) == _noise_of(one)
+    assert noise_of_map(one) == SensorNoise(range_sigma=0.01, bearing_sigma=0.002)
+    assert noise_of_map({"merged": [one, {"merged": [one, one]}]}) == noise_of_map(one)
     for settings in ({}, {"merged": [one, other]}, {"merged": [one, 3]}, {"merged": []}):
-        assert _noise_of(settings) is None
+        assert noise_of_map(settings) is None
     for noise in (1, {"range_sigma": 0.01}, {"range_sigma": "much", "bearing_sigma": 0.0}):
-        assert _noise_of({"noise": noise}) is None
+        assert noise_of_map({"noise": noise}) is None
 
 
 def test_the_noise_of_the_map_counts(room: dict[str, Any], tmp_path: Path) -> None:

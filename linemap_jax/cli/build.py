@@ -13,6 +13,7 @@ import tyro
 from linemap_jax.cli.history import History
 from linemap_jax.cli.logs import SCANS_EXPLAINED, chunks_of_log, mount_of, opened, progress, tell_poses, warn
 from linemap_jax.cli.mapping import map_of_pieces
+from linemap_jax.cli.noise import noise_of_map, states_noise
 from linemap_jax.cli.options import LogOptions, options_of_update, own_options_first
 from linemap_jax.cli.output import check_output, make_folder, say
 from linemap_jax.cli.rejections import Rejections
@@ -48,7 +49,8 @@ class Build(LogOptions):
     json: bool = False
     """Print the summary as JSON."""
     resume_from: Annotated[Path | None, tyro.conf.arg(metavar="MAP")] = None
-    """Map to go on from, in the frame of the log, as if its log and this one were one drive."""
+    """Map to go on from, in the frame of the log, as if its log and this one were one drive. The noise is that of this
+    map, unless it is stated."""
     html: bool = False
     """Write map.html too: a page to explore, with a slider over the map on the way."""
 
@@ -65,6 +67,8 @@ class Build(LogOptions):
         map_file, picture, page = (self.output / f"map.{ending}" for ending in ("json", "png", "html"))
         check_output(self.output, map_file, picture, *([page] if self.html else []), overwrite=self.overwrite)
         before = map_to_resume(self.resume_from, self.dtype) if self.resume_from else None
+        if before is not None and not states_noise(self):
+            options["noise"] = noise_of_map(before.settings) or options["noise"]
         log = opened(self, self.log)
         options["mount"] = mount_of(self, log, quiet=self.quiet)
         if log.notes.drift:

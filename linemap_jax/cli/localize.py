@@ -13,13 +13,13 @@ import tyro
 
 from linemap_jax.cli.compilations import cache_folder
 from linemap_jax.cli.logs import chunks_of_log, mount_of_odometry, odometry_of, opened, progress, warn
+from linemap_jax.cli.noise import noise_of_map, states_noise
 from linemap_jax.cli.options import POSE_SIGMA, LogOptions, UsageError, options_of_update, own_options_first
 from linemap_jax.cli.output import check_output, make_folder, say
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from linemap_jax.core.settings import SensorNoise
     from linemap_jax.core.state import LineMap
     from linemap_jax.io.reading import Log
 
@@ -74,8 +74,8 @@ class Localize(LogOptions):
             if self.map.exists() and swapped.exists() and swapped.suffix in (".json", ".geojson"):
                 raise UsageError(f"{error}; the map comes first, then the log") from error
             raise
-        if not _states_noise(self):
-            options["noise"] = _noise_of(of_map) or options["noise"]
+        if not states_noise(self):
+            options["noise"] = noise_of_map(of_map) or options["noise"]
         if not _tells_sides(of_map):
             options["rules"] = dataclasses.replace(options["rules"], tell_sides=False)
         if not line_map.lines.valid.any():
@@ -128,32 +128,6 @@ def _check(command: Localize) -> None:
         raise UsageError(f"--start-sigma must be zero or positive, not {command.start_sigma}")
     if not 0 < command.odometry_noise < math.inf:
         raise UsageError(f"--odometry-noise must be positive, not {command.odometry_noise}")
-
-
-def _states_noise(command: Localize) -> bool:
-    """Whether the command says what the noise is."""
-    from linemap_jax.io.config import read_config
-
-    given = (command.scanner, command.range_sigma, command.bearing_sigma)
-    return any(x is not None for x in given) or bool(command.config and "noise" in read_config(command.config))
-
-
-def _noise_of(settings: Mapping[str, Any]) -> "SensorNoise | None":
-    """The noise that a map was built with; None if it does not tell, or was merged of maps that differ."""
-    from linemap_jax.core.settings import SensorNoise
-
-    merged, noise = settings.get("merged"), settings.get("noise")
-    if isinstance(merged, list) and merged:
-        first, *others = (_noise_of(each) if isinstance(each, Mapping) else None for each in merged)
-        return first if all(each == first for each in others) else None
-    names = [field.name for field in dataclasses.fields(SensorNoise)]
-    if not (isinstance(noise, Mapping) and all(_is_sigma(noise.get(name)) for name in names)):
-        return None
-    return SensorNoise(**{name: float(noise[name]) for name in names})
-
-
-def _is_sigma(value: Any) -> bool:
-    return isinstance(value, int | float) and 0 <= value < math.inf
 
 
 def _tells_sides(settings: Mapping[str, Any]) -> bool:

@@ -467,10 +467,11 @@ def passed_circles(
         to_left, to_right = witness & (aside <= met - unsure), witness & (aside >= unsure - met)
         return jnp.any(to_left) & jnp.any(to_right) & ~jnp.any(wide)
 
-    windows = (*computed_once(jax.vmap(window), circles.center), circles.radius)
+    to_center, unsure, deep, slack = computed_once(jax.vmap(window), circles.center)
+    windows = to_center, unsure, deep, slack, circles.radius
     passed = circles.valid & jax.vmap(unhindered)(*windows)
     # Rarely is there any: of a scan that meets the circles that it can see, no second look at all beams is taken.
-    return passed & jax.lax.cond(jnp.any(passed), jax.vmap(covered), lambda *_: jnp.zeros_like(passed), *windows)
+    return passed & jax.lax.cond(jnp.any(passed), lambda: jax.vmap(covered)(*windows), lambda: jnp.zeros_like(passed))
 
 
 def _two_sums(a: Bool[Array, " N"], b: Bool[Array, " N"]) -> tuple[Int[Array, ""], Int[Array, ""]]:
