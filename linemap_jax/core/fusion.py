@@ -17,7 +17,7 @@ from linemap_jax.core.frames import dot, perp, shift_matrix, unit, wrap_angle
 from linemap_jax.core.matching import CircleMatches, compare_lines, with_sign
 from linemap_jax.core.propagation import apply, inverse, product, safe_sqrt, square_root, symmetric
 from linemap_jax.core.settings import Number, PoseError, Rules, Thresholds
-from linemap_jax.core.slots import choose, computed_once, first_true, least, put, take
+from linemap_jax.core.slots import choose, computed_once, first_of_group, least, put, take
 from linemap_jax.core.state import Circles, Lines, Pose, pytree, squared
 
 JACOBIAN_ERROR = 0.005
@@ -282,7 +282,7 @@ def fuse_circles(model: Circles, new: Circles, matches: CircleMatches, rules: Ru
     """
     matched = matches.slot >= 0
     together = (matches.slot[:, None] == matches.slot[None]) & matched[:, None]
-    # The sum over those that go together, and a mean that is one of a single one where there are none
+    # A mean of none divides by one.
     count = jnp.maximum(jnp.sum(together, -1), 1).astype(new.radius.dtype)
     mine = take(model, matches.slot)
     old, seen = (jnp.concatenate([x.center, x.radius[:, None]], -1) for x in (mine, new))
@@ -322,8 +322,7 @@ def fuse_circles(model: Circles, new: Circles, matches: CircleMatches, rules: Ru
         times_detected=times + times_new,
     )
     # All that match one circle have the same result; the first one writes it.
-    first = matched & (jax.vmap(first_true)(together) == jnp.arange(matched.shape[0]))
-    return put(model, jnp.where(first, matches.slot, -1), improved)
+    return put(model, jnp.where(first_of_group(together), matches.slot, -1), improved)
 
 
 def _at_radius(

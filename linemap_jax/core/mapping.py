@@ -32,7 +32,7 @@ from linemap_jax.core.settings import (
     Thresholds,
     persistence_of,
 )
-from linemap_jax.core.slots import choose, directed, first_true, free_slots, neutral_where_free, put, take
+from linemap_jax.core.slots import choose, directed, first_of_group, free_slots, neutral_where_free, put, take
 from linemap_jax.core.state import (
     LEFT_OUT,
     NEW,
@@ -248,7 +248,7 @@ def _update_lines(
     together = (targets[:, None] == targets[None]) & (targets >= 0)[None]
     fused = fusion.fuse_lines(mine, has_prior, new, together, thresholds, rules, pose_error, share)
     # All pieces of a line have the same result; the first one writes it.
-    first = (targets >= 0) & (jax.vmap(first_true)(together) == jnp.arange(targets.shape[0]))
+    first = first_of_group(together)
     model = put(model, jnp.where(first, targets, -1), fused)
 
     slot = jnp.where(leader >= 0, NEW, match.slot)

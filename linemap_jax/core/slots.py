@@ -26,6 +26,11 @@ def first_true(which: Bool[Array, " K"]) -> Int[Array, ""]:
     return jnp.min(jnp.where(which, jnp.arange(k, dtype=jnp.int32), k))
 
 
+def first_of_group(together: Bool[Array, "L L"]) -> Bool[Array, " L"]:
+    """Which items are the first of all that go `together` with them; false for an item whose row is empty."""
+    return jax.vmap(first_true)(together) == jnp.arange(together.shape[0])
+
+
 def all_true(which: Bool[Array, " N"], size: int) -> Int[Array, " M"]:
     """Indices of the first `size` true ones of `which`, in order; `N` where there are no more."""
     n = which.shape[0]

@@ -447,10 +447,15 @@ def passed_circles(
         unsure, deep, slack = (thresholds.wipe_sigmas * sigma for sigma in (lateral, depth, slack))
         return to_center, unsure, deep, slack
 
+    def in_window(beams: Array, to_center: Array, half: Array) -> tuple[Array, Array, Array]:
+        """How far along the beams and aside of them the centre lies, and which of them go through the window."""
+        along, aside = dot(beams, to_center[None]), _cross(beams, to_center[None])
+        return along, aside, (jnp.abs(aside) < half) & (along > 0)
+
     def unhindered(to_center: Array, unsure: Array, deep: Array, slack: Array, radius: Array) -> Array:
         """Whether all beams through the window end beyond it, and there are two of them."""
-        along, aside = dot(beams, to_center[None]), _cross(beams, to_center[None])
-        witness = swath.points.valid & (jnp.abs(aside) < radius + unsure) & (along > 0)
+        along, _, inside = in_window(beams, to_center, radius + unsure)
+        witness = swath.points.valid & inside
         beyond = swath.points.range > along + radius + deep
         # Two counts in one sum: each costs a walk over all beams of all circles.
         witnesses, stopped = _two_sums(witness, witness & ~beyond)
@@ -458,10 +463,9 @@ def passed_circles(
 
     def covered(to_center: Array, unsure: Array, deep: Array, slack: Array, radius: Array) -> Array:
         """Whether no two neighbours of these beams leave room for the circle between them, nor the last and the rim."""
-        along, next_along = dot(beams, to_center[None]), dot(next_beams, to_center[None])
-        aside, next_aside = _cross(beams, to_center[None]), _cross(next_beams, to_center[None])
-        witness = swath.points.valid & (jnp.abs(aside) < radius + unsure) & (along > 0)
-        next_too = follows & (jnp.abs(next_aside) < radius + unsure) & (next_along > 0)
+        _, aside, inside = in_window(beams, to_center, radius + unsure)
+        _, next_aside, next_inside = in_window(next_beams, to_center, radius + unsure)
+        witness, next_too = swath.points.valid & inside, follows & next_inside
         met = radius - slack  # a beam that passes the centre by less has met the circle, if it is there
         wide = witness & next_too & (aside - next_aside > 2 * met)
         to_left, to_right = witness & (aside <= met - unsure), witness & (aside >= unsure - met)
