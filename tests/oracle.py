@@ -548,7 +548,32 @@ def length_of_run(points: np.ndarray) -> float:
     return float(np.array([-math.sin(angle), math.cos(angle)]) @ (points[-1] - points[0]))
 
 
-def without_corners(sweep: Sweep, runs: list[list[int]], margin: Margin) -> list[list[int]]:
+def bends(sweep: Sweep, run: list[int], thresholds: Any, margin: Margin) -> bool:
+    """Whether a run bulges towards the scanner as a pole does: surely, and no flatter than twice the largest one.
+
+    Args:
+      sweep: the valid beams.
+      run: positions in the sweep.
+      thresholds: `cluster_distance`.
+      margin: notes how clear the decisions were.
+    """
+    line = regression(sweep.o[run])
+    normal = np.array([math.cos(line.angle), math.sin(line.angle)])
+    if normal @ (line.centroid - sweep.laser) < 0:
+        normal = -normal
+    from_middle = sweep.o[run] - line.centroid
+    along, depth = from_middle @ np.array([-normal[1], normal[0]]), from_middle @ normal
+    # What is left of the parabola when a straight line has been taken out of it
+    design = np.stack([np.ones_like(along), along], -1)
+    parabola = along**2 - design @ np.linalg.lstsq(design, along**2, rcond=None)[0]
+    spread = float(parabola @ parabola)
+    curvature, cos2 = 2 * float(parabola @ depth), (sweep.u[run] @ normal) ** 2
+    variance = float(np.mean(sweep.sr**2 * cos2 + (sweep.r[run] * sweep.sa) ** 2 * (1 - cos2)))
+    surely = margin.below(2 * UNSURE_SIGMAS * math.sqrt(variance * spread), curvature)
+    return surely and margin.below(spread, 2 * float(thresholds.cluster_distance) * curvature)
+
+
+def without_corners(sweep: Sweep, runs: list[list[int]], arcs: list[list[int]], margin: Margin) -> list[list[int]]:
     """The points of each run that no line beside it can claim.
 
     At an end of a run, points may be the next line's that still passed criterion 2. They are left out up to the first
@@ -557,6 +582,7 @@ def without_corners(sweep: Sweep, runs: list[list[int]], margin: Margin) -> list
     Args:
       sweep: the valid beams.
       runs: those that are lines, in their order, each a list of positions in the sweep.
+      arcs: those of them that are none after all.
       margin: notes how clear the decisions were.
     """
     lines = [regression(sweep.o[run]) for run in runs]
@@ -564,7 +590,7 @@ def without_corners(sweep: Sweep, runs: list[list[int]], margin: Margin) -> list
     for k, run in enumerate(runs):
         begin, end = 0, len(run)
         for side in (-1, 1):
-            if not 0 <= k + side < len(runs):
+            if not 0 <= k + side < len(runs) or runs[k + side] in arcs:
                 continue
             beside = lines[k + side]
             normal = np.array([math.cos(beside.angle), math.sin(beside.angle)])
@@ -644,7 +670,7 @@ def without_strange_ends(
 def without_near_ends(
     sweep: Sweep, runs: list[list[int]], kept: list[list[int]], thresholds: Any, margin: Margin
 ) -> list[list[int]]:
-    """The points of each run without those near its ends; without its two outermost ones, or with all, if few.
+    """The points of each run without its first and last one, and without others near them as long as enough are left.
 
     Args:
       sweep: the valid beams.
@@ -655,15 +681,16 @@ def without_near_ends(
     """
     result = []
     for run, mine in zip(runs, kept, strict=True):
-        inner = []
-        for i in mine:
+        spare = 1
+        while _are_enough(len(run) - 2 * (spare + 1), run):
+            spare += 1
+        left_out = {run[0], run[-1]}
+        for i in {*run[:spare], *run[-spare:]} - left_out:
             gate = float(thresholds.line_sigmas) * math.hypot(sweep.sr, sweep.r[i] * sweep.sa)
-            gate = max(float(thresholds.line_distance), gate)
-            far = [not margin.below(math.dist(sweep.o[i], sweep.o[end]), gate) for end in (run[0], run[-1])]
-            if all(far) and i not in (*run[:2], *run[-2:]):
-                inner.append(i)
-        without_two = [i for i in mine if i not in (run[0], run[-1])]
-        result.append(next((some for some in (inner, without_two) if _are_enough(len(some), run)), mine))
+            gate = 1.5 * max(float(thresholds.line_distance), gate)
+            if any(margin.below(math.dist(sweep.o[i], sweep.o[end]), gate) for end in (run[0], run[-1])):
+                left_out.add(i)
+        result.append([i for i in mine if i not in left_out])
     return result
 
 
@@ -924,7 +951,7 @@ def _circle_of_cluster(
     sight = (centroid - sweep.laser) / np.hypot(*(centroid - sweep.laser))
     good = (
         not margin.below(fit.radius + 3 * math.sqrt(fit.cov[2, 2]), 5 * sweep.sr)
-        and margin.below(fit.radius, float(thresholds.cluster_distance))
+        and margin.below(fit.radius - 3 * math.sqrt(fit.cov[2, 2]), float(thresholds.cluster_distance))
         and margin.below(0.0, sight @ fit.center)
         and not margin.below(n - 3 + 3 * math.sqrt(2 * (n - 3)), fit.chi2)
         and margin.below(math.sqrt(fit.cov[2, 2]), fit.radius / 3)
@@ -1024,7 +1051,10 @@ def extract(
         else:
             in_line[run] = True
             of_lines.append(run)
-    kept_points = without_corners(sweep, of_lines, margin) if rules.leave_out_corners else of_lines
+    arcs = [run for run in of_lines if rules.leave_out_arcs and bends(sweep, run, thresholds, margin)]
+    for run in arcs:
+        in_line[run] = False
+    kept_points = without_corners(sweep, of_lines, arcs, margin) if rules.leave_out_corners else of_lines
     if rules.leave_out_sparse:
         kept_points = without_sparse(sweep, of_lines, kept_points, thresholds, margin)
     if rules.check_ends:
@@ -1033,6 +1063,8 @@ def extract(
         kept_points = without_near_ends(sweep, of_lines, kept_points, thresholds, margin)
     found = []
     for run, points in zip(of_lines, kept_points, strict=True):
+        if run in arcs:
+            continue
         if not _are_enough(len(points), run):
             rejected["too_few"] += len(run)
             continue
@@ -1766,10 +1798,21 @@ def match_circle(
     return Match(j, -1, nis, 3), float(distance[j])
 
 
-def _wiped_by_beams(circles: Circles, slot: int, sweep: Sweep, *, thresholds: Any) -> bool:
+def _wiped_by_beams(
+    circles: Circles, slot: int, sweep: Sweep, found: Lines, measured: np.ndarray, *, thresholds: Any
+) -> bool:
     """Whether beams have passed through the place of a circle, and none has ended at it or before it.
 
-    Wherever it may stand, a beam must have met it: it is pushed from one end of its window to the other.
+    Wherever it may stand, a beam must have met it: it is pushed from one end of its window to the other. A beam that
+    has ended on a line of the map has passed what stood between the scanner and that line.
+
+    Args:
+      circles: of the map.
+      slot: the circle.
+      sweep: the valid beams.
+      found: the lines of the scan.
+      measured: which of them each beam measures, -1 for none, or for one that is not in the map. Shape `[n]`.
+      thresholds: the margins.
     """
     sigmas = float(thresholds.wipe_sigmas)
     radius = circles.radius[slot]
@@ -1784,7 +1827,12 @@ def _wiped_by_beams(circles: Circles, slot: int, sweep: Sweep, *, thresholds: An
     width = radius + sigmas * math.sqrt(perp(u) @ cov @ perp(u) + rc**2 * sweep.sa**2)
     depth = radius + sigmas * math.sqrt(sweep.sr**2 + u @ cov @ u)
     evidence = (np.abs(across) < width) & (along > 0)
-    if evidence.sum() < 2 or not (sweep.r[evidence] > along[evidence] + depth).all():
+    passed = sweep.r > along + depth
+    ahead = dot(found.normal, found.anchor - sweep.p - sweep.laser) + found.offset
+    for k in set(measured.tolist()) - {-1}:
+        before = math.copysign(1, ahead[k]) * ((sweep.o - o) @ found.normal[k])
+        passed |= (measured == k) & (before > depth - radius)
+    if evidence.sum() < 2 or not passed[evidence].all():
         return False
     # What a beam is off by itself: nearer to the rim than that it may have passed.
     sure = radius - sigmas * rc * sweep.sa
@@ -1835,6 +1883,7 @@ def _update_circles(
     found: Extraction,
     sweep: Sweep,
     targets: np.ndarray,
+    measured: np.ndarray,
     triangles: list[np.ndarray],
     report: Report,
     *,
@@ -1863,7 +1912,7 @@ def _update_circles(
         if slot in members:
             continue
         if rules.wipe_by_beams:
-            gone = _wiped_by_beams(circles, slot, sweep, thresholds=thresholds)
+            gone = _wiped_by_beams(circles, slot, sweep, found.lines, measured, thresholds=thresholds)
         else:
             gone = any(_inside(circles.center[slot], triangle) for triangle in triangles)
         if gone:
@@ -1997,8 +2046,10 @@ def update(
         for slots in (targets, suspects, report.line_slot):
             slots[:] = [freed.get(slot, slot) for slot in slots.tolist()]
 
+    own = np.where(targets >= 0, targets, suspects)
+    label = found.line_of_beam[sweep.beam]
+    measured = np.where(np.append(own, -1)[label] >= 0, label, -1)
     if rules.wipe_by_beams:
-        own = np.where(targets >= 0, targets, suspects)
         cuts = beam_cuts(lines, sweep, found, own, targets, thresholds=thresholds, rules=rules)
         _cut(lines, cuts, sweep, report, thresholds=thresholds, rules=rules)
     elif mode == "simultaneous":
@@ -2017,6 +2068,7 @@ def update(
         found,
         sweep,
         targets,
+        measured,
         triangles,
         report,
         thresholds=thresholds,

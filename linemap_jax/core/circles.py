@@ -263,9 +263,9 @@ def _fit_circles(
         & jnp.all(jnp.isfinite(cov), (-1, -2))
         & jnp.all(variances > 0, -1)  # rounding has the last word where the beams say nothing of a direction
         # Smaller ones are lost in the noise. Held against the estimate itself, poles of just this radius would be kept
-        # if they seem too large and turned away if they seem too small, and come out too large.
+        # if they seem too large and turned away if they seem too small, and come out too large. So with larger ones.
         & (radius + 3 * safe_sqrt(var_radius) >= 5 * noise.range_sigma)
-        & (radius < thresholds.cluster_distance)
+        & (radius - 3 * safe_sqrt(var_radius) < thresholds.cluster_distance)
         & (dot(-laser, center) > 0)  # we see the near side of a pole, never its inside
         & (misfit <= dof + 3 * jnp.sqrt(2 * dof))  # 3 sigma of chi-square
         & (var_radius < (radius / 3) ** 2)

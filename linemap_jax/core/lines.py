@@ -31,6 +31,9 @@ UNSURE_SIGMAS = 3.0
 LEAST_SHARE = 1 / 3
 """Of the points of a run must be left for the fit. A line through few of them, chosen by the line through all, would
 err by far more than it says."""
+WIDENED = 1.5
+"""Gate of criterion 2 at the end of a run of a few points, by that of a long one: what their line is uncertain by adds
+to the noise of the point, four times its variance over their number, and points that passed have turned it."""
 INWARD = 4
 """So many points of a run are asked from either end whether they may end the line."""
 GRAZING = 0.01
@@ -375,10 +378,49 @@ def choose_points(points: Points, runs: Runs, thresholds: Thresholds, noise: Sen
     if rules.check_ends:
         kept &= ~_strange_ends(points, runs, fit, normal, thresholds, noise)
     if rules.leave_out_ends:
-        kept &= ~_near_ends(points, runs, kept, fit.count, thresholds, noise)
+        kept &= ~_near_ends(points, runs, fit.count, thresholds, noise)
     count = runs.sum(kept.astype(fit.count.dtype))
     valid = runs.valid & _enough(count, fit.count)
     return dataclasses.replace(runs, of_point=jnp.where(kept, runs.of_point, -1), valid=valid)
+
+
+def leave_out_arcs(points: Points, runs: Runs, thresholds: Thresholds, noise: SensorNoise) -> Runs:
+    """The runs without those that bend as a pole does; their points are left to the circles.
+
+    The gate of criterion 2 is five sigma wide. With noise of 2 cm the front of a pole of 20 cm passes it, point by
+    point; all points together tell. A run goes if the parabola through it bulges towards the scanner, surely so, and no
+    flatter than a circle of twice the largest radius that is fitted. What is told by residuals from the line has no
+    part in the line, so that walls that go by mistake do not bias those that stay.
+
+    Args:
+      points: the points of the scan.
+      runs: the runs that may be lines.
+      thresholds: `cluster_distance`, the largest radius.
+      noise: of the sensor.
+
+    Returns:
+      The runs, fewer, in the same slots.
+    """
+    fit = regress(points.position, runs)
+    tangent = fit.direction / jnp.sqrt(dot(fit.direction, fit.direction))[:, None]
+    middle = fit.origin + fit.centroid
+    ahead = dot(perp(tangent), middle - points.laser[None]) > 0
+    away = jnp.where(ahead, 1, -1)[:, None] * perp(tangent)
+    mine = runs.spread(jnp.concatenate([tangent, away, middle], -1))
+    from_middle = points.position - mine[:, 4:]
+    along, depth = dot(mine[:, :2], from_middle), dot(mine[:, 2:4], from_middle)
+    variance = _var_across(dot(mine[:, 2:4], points.beam) ** 2, points.range, noise)
+    square = along * along
+    columns = [square, square * along, square * square, along * depth, square * depth, variance]
+    s2, s3, s4, along_depth, square_depth, variance = jnp.moveaxis(runs.sum(jnp.stack(columns, -1)), -1, 0)
+    # The square of the distance along the line, less the line through that, regressed on the depth
+    s2 = jnp.where(s2 > 0, s2, 1)
+    spread = s4 - s2 * s2 / fit.count - s3 * s3 / s2
+    bulge = square_depth - s3 * along_depth / s2
+    surely = (bulge > 0) & (bulge * bulge > UNSURE_SIGMAS**2 * variance / fit.count * spread)
+    bent = surely & (4 * thresholds.cluster_distance * bulge > spread)
+    of_point = jnp.where((runs.of_point >= 0) & runs.spread(bent), -1, runs.of_point)
+    return dataclasses.replace(runs, of_point=of_point, valid=runs.valid & ~bent)
 
 
 def _at_corners(
@@ -460,33 +502,25 @@ def _strange_ends(
 
 
 def _near_ends(
-    points: Points,
-    runs: Runs,
-    kept: Bool[Array, " N"],
-    size: Float[Array, " K"],
-    thresholds: Thresholds,
-    noise: SensorNoise,
+    points: Points, runs: Runs, size: Float[Array, " K"], thresholds: Thresholds, noise: SensorNoise
 ) -> Bool[Array, " N"]:
-    """The points nearest to the ends of the runs, where enough are left without them.
+    """The points nearest to the ends of the runs: the first and the last one, and more where enough are left.
 
     Past an end of a wall criterion 2 lets points of what stands across it pass, until they are as far away as it
     reaches. One scan hardly shows it, but fifty scans from one side all err alike. So whoever they are, what is as near
-    as that to the first or last point of a run is left out, and two points at least; where too few are left then, the
-    first and the last one; and none where these are needed. Who decides by residuals keeps those that noise has moved
-    to the line.
+    as that to the first or last point of a run is left out, while enough are left; and the first and the last one
+    always: of a wall that four beams meet, one in three lines had a point of what stands across it. Who decides by
+    residuals keeps those that noise has moved to the line.
     """
-    index = jnp.arange(kept.shape[0], dtype=jnp.int32)
-    in_run = runs.of_point >= 0
+    index = jnp.arange(runs.of_point.shape[0], dtype=jnp.int32)
     ends = runs.spread(jnp.concatenate([points.position[runs.first], points.position[runs.last]], -1))
     from_end = jnp.minimum(index - runs.first[runs.of_point], runs.last[runs.of_point] - index)
     reach2 = thresholds.line_sigmas**2 * (noise.range_sigma**2 + (points.range * noise.bearing_sigma) ** 2)
-    reach2 = jnp.maximum(reach2, thresholds.line_distance**2)
+    reach2 = WIDENED**2 * jnp.maximum(reach2, thresholds.line_distance**2)
     steps = points.position - ends[:, :2], points.position - ends[:, 2:]
-    near = in_run & ((from_end < 2) | (dot(steps[0], steps[0]) < reach2) | (dot(steps[1], steps[1]) < reach2))
-    outermost = in_run & (from_end < 1)
-    left = runs.sum(jnp.stack([kept & ~near, kept & ~outermost], -1).astype(size.dtype))
-    many, some = (runs.spread(_enough(left[:, i], size)) for i in (0, 1))
-    return jnp.where(many, near, some & outermost)
+    near = (dot(steps[0], steps[0]) < reach2) | (dot(steps[1], steps[1]) < reach2)
+    spare = jnp.maximum((size - jnp.maximum(jnp.ceil(LEAST_SHARE * size), MIN_POINTS)) // 2, 1)
+    return (runs.of_point >= 0) & ((from_end < 1) | (near & (from_end < runs.spread(spare))))
 
 
 def _enough(count: Float[Array, " K"], size: Float[Array, " K"]) -> Bool[Array, " K"]:

@@ -48,7 +48,7 @@ class Thresholds:
     """Shortest line that is modelled, and shortest fragment that wiping leaves, m (s4.3.1, s6.3)."""
     cluster_distance: Number = 0.3
     """[d_critc] Largest distance of a new point from the centre of its cluster, m; also the largest radius of a fitted
-    circle."""
+    circle, which may seem larger by 3 sigma."""
     circle_line_distance: Number = 0.1
     """Circles whose centre is closer than this to a line are not modelled, m (s4.3.1, circles): five sigma of a range
     of 2 cm, since it is the noise of the line that is meant. `paper`: 0.15."""
@@ -165,6 +165,8 @@ class Rules:
     maximum_likelihood: bool = True
     """The line of a run is the most likely one, for noise along the beams. Regression takes the noise to lie across,
     and is biased where a wall is seen at a slant."""
+    leave_out_arcs: bool = True
+    """A run that bends as a pole does is no line; its points are left to the circles."""
     leave_out_corners: bool = True
     """Points at the end of a run that may belong to the line beside it take no part in the fit."""
     leave_out_sparse: bool = True
@@ -174,8 +176,9 @@ class Rules:
     """The first and last point of a run take no part in the fit where criterion 2 does not hold between them and the
     line of the others: the first three points of a run make its line, whatever they are."""
     leave_out_ends: bool = True
-    """The points nearest to the ends of a run take no part in the fit, as far as criterion 2 reaches and two at least,
-    where enough are left: of what stands across, as the end face of a partition does, points pass the gate."""
+    """The first and the last point of a run take no part in the fit, nor do others as near to them as criterion 2
+    reaches, while enough are left: of what stands across, as the end face of a partition does, points pass the gate.
+    A line has five points then, at least."""
     fit_circles: bool = True
     """Fit a circle to a cluster where there are points enough. Eqs. (18)-(20) describe the visible arc: a centre that
     lies before the pole's and moves with the viewpoint."""

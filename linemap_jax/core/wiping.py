@@ -41,6 +41,8 @@ class Swath:
     """Slot of the map's line that the beam measures, -1 for none."""
     times: Int[Array, " N"]
     """How often that line was detected, 0 for none."""
+    behind: Float[Array, "N 2"]
+    """Normal of the new line that the beam ended on, away from the scanner; zero where it is none of the map."""
     joined: Bool[Array, " N"]
     """Whether the beam is a neighbour of the next one."""
     robot: Float[Array, "2"]
@@ -107,15 +109,18 @@ def swath_of_scan(
       What `passed_through` needs, of `N` beams.
     """
     to_line = found.anchor - (pose.mean[:2] + points.laser)[None]
-    across = jnp.abs(found.offset + dot(found.normal, to_line))  # the scanner from each line
+    ahead = found.offset + dot(found.normal, to_line)  # each line from the scanner
+    across = jnp.abs(ahead)
     pushed = jnp.where(across > NEAREST_BASE, 1 + thresholds.wipe_extension / jnp.maximum(across, NEAREST_BASE), 0)
     followed = (points.turn < thresholds.gap_beams * points.spacing) & points.valid
     in_line = line_of_point >= 0
+    behind = jnp.where((own >= 0)[:, None], jnp.sign(ahead)[:, None] * found.normal, 0)
     return Swath(
         points=points,
         reach=jnp.where(in_line, points.range * pushed[line_of_point], 0),
         own=jnp.where(in_line, own[line_of_point], -1),
         times=jnp.where(in_line, times[line_of_point], 0),
+        behind=jnp.where(in_line[:, None], behind[line_of_point], 0),
         joined=jnp.concatenate([followed[1:], jnp.zeros(1, bool)]),
         robot=pose.mean[:2],
     )
@@ -411,7 +416,8 @@ def passed_circles(
     A circle is gone if every beam through the window in which it may stand, at least two of them, ends beyond it; and
     if no two of them, nor the last of them and the edge of that window, are so far apart that it may stand between: a
     pole at the rim of what the scanner sees, or among beams without a return, stays. A beam that meets it by less than
-    beams err by may have gone past, so that a thin pole far away stays too.
+    beams err by may have gone past, so that a thin pole far away stays too. Where something stood by a wall, beams that
+    measure this line of the map end beyond it if its centre lies in front of the line.
 
     Args:
       circles: the `C` circles of the map.
@@ -456,7 +462,8 @@ def passed_circles(
         """Whether all beams through the window end beyond it, and there are two of them."""
         along, _, inside = in_window(beams, to_center, radius + unsure)
         witness = swath.points.valid & inside
-        beyond = swath.points.range > along + radius + deep
+        to_line = dot(swath.behind, swath.points.position - (swath.points.laser + to_center)[None])
+        beyond = (swath.points.range > along + radius + deep) | (to_line > deep)
         # Two counts in one sum: each costs a walk over all beams of all circles.
         witnesses, stopped = _two_sums(witness, witness & ~beyond)
         return (witnesses >= 2) & (stopped == 0)

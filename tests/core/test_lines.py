@@ -371,23 +371,37 @@ def test_three_points_of_two_walls_are_no_line() -> None:
     bearings = np.radians([-3.0, 0.0, 3.0])
     for off, rule, a_line in ((0.0, True, True), (0.3, False, True), (0.3, True, False)):
         scan = Scan.from_ranges(10 / np.cos(bearings) - np.array([off, 0, 0]), bearings)
-        rules = Rules(leave_out_sparse=False, check_ends=rule)
+        rules = Rules(leave_out_sparse=False, check_ends=rule, leave_out_ends=False)
         found = extract(scan, Pose(mean=jnp.zeros(3), cov=jnp.zeros((3, 3))), rules=rules)
         assert bool(found.lines.valid[0]) == a_line
 
 
+@pytest.mark.parametrize("count", [3, 4])
+def test_too_few_points_to_leave_out_the_ends_are_no_line(count: int) -> None:
+    bearings = np.radians(np.arange(count) - (count - 1) / 2)
+    here = Pose(mean=jnp.zeros(3), cov=jnp.zeros((3, 3)))
+    for rule, a_line in ((False, True), (True, False)):
+        rules = Rules(leave_out_sparse=False, leave_out_ends=rule)
+        found = extract(Scan.from_ranges(20 / np.cos(bearings), bearings), here, rules=rules)
+        assert bool(found.lines.valid[0]) == a_line
+        assert int(found.rejected.too_few) == (0 if a_line else count)
+
+
 @pytest.mark.parametrize(
-    ("count", "left_out"),
+    ("count", "spacing", "left_out"),
     [
-        (4, []),  # three would not be left
-        (6, [0, 5]),  # three would not be left without the outermost two
-        (7, [0, 1, 5, 6]),  # of 17 cm between points, two at each end
-        (61, [*range(6), *range(55, 61)]),  # of 1.7 cm, those within 10 cm, which are 5 sigma
+        (5, 0.1, [0, 4]),  # 1.7 cm between points: three are left
+        (6, 0.1, [0, 5]),
+        (7, 0.1, [0, 1, 5, 6]),
+        (7, 1.0, [0, 6]),  # 17 cm between points: no other is near
+        (15, 0.1, [*range(5), *range(10, 15)]),  # a third is left
+        (61, 0.1, [*range(9), *range(52, 61)]),  # those within 15 cm, which are 7.5 sigma
     ],
 )
-def test_points_near_the_ends_are_left_out_where_enough_are_left(count: int, left_out: list[int]) -> None:
+def test_points_near_the_ends_are_left_out_where_enough_are_left(
+    count: int, spacing: float, left_out: list[int]
+) -> None:
     """A wall 10 m ahead, seen from -3 to 3 degrees at most."""
-    spacing = 1.0 if count < 10 else 0.1
     bearings = np.radians(spacing * (np.arange(count) - (count - 1) / 2))
     here = Pose(mean=jnp.zeros(3), cov=jnp.zeros((3, 3)))
     points = points_from_scan(Scan.from_ranges(10 / np.cos(bearings), bearings), here, Mount(), jacobians="analytic")

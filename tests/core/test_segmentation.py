@@ -187,9 +187,10 @@ def test_a_gap_that_breaks_by_two_criteria_counts_as_distance() -> None:
 
 @pytest.mark.parametrize(("n", "is_line"), [(1, False), (2, False), (3, True)])
 def test_three_points_make_a_line(n: int, is_line: bool) -> None:
+    """Unless the first and the last of them are left out of the fit."""
     ranges = np.full(N, np.nan)
     ranges[18 : 18 + n] = WALL[18 : 18 + n]
-    found = extracted(ranges, Thresholds(min_length=0.05))
+    found = extracted(ranges, Thresholds(min_length=0.05), leave_out_ends=False)
     assert bool(found.lines.valid[0]) == is_line
     assert counts(found).get("too_few", 0) == (0 if is_line else n)
     assert counts(found).get("lone", 0) == (1 if n == 1 else 0)
