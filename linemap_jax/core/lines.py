@@ -414,9 +414,9 @@ def leave_out_arcs(points: Points, runs: Runs, thresholds: Thresholds, noise: Se
     columns = [square, square * along, square * square, along * depth, square * depth, variance]
     s2, s3, s4, along_depth, square_depth, variance = jnp.moveaxis(runs.sum(jnp.stack(columns, -1)), -1, 0)
     # The square of the distance along the line, less the line through that, regressed on the depth
-    s2 = jnp.where(s2 > 0, s2, 1)
-    spread = s4 - s2 * s2 / fit.count - s3 * s3 / s2
-    bulge = square_depth - s3 * along_depth / s2
+    skew = s3 / jnp.where(s2 > 0, s2, 1)
+    spread = s4 - s2 * s2 / fit.count - s3 * skew
+    bulge = square_depth - skew * along_depth
     surely = (bulge > 0) & (bulge * bulge > UNSURE_SIGMAS**2 * variance / fit.count * spread)
     bent = surely & (4 * thresholds.cluster_distance * bulge > spread)
     of_point = jnp.where((runs.of_point >= 0) & runs.spread(bent), -1, runs.of_point)

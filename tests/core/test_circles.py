@@ -214,6 +214,18 @@ def test_too_few_points_are_not_fitted() -> None:
         assert only(extracted(some, fit=True))["fitted"] == fitted
 
 
+def test_the_largest_radius_may_seem_larger_by_three_sigma() -> None:
+    """Else poles of just that radius would be kept where they seem too small, and come out too small."""
+    ranges = np.where(np.abs(BEARINGS) < np.radians(6), pole((2.2, 0.0), 0.32), np.nan)  # else it makes two clusters
+    found = {
+        sigma: only(extracted(ranges, fit=True, noise=SensorNoise(range_sigma=sigma, bearing_sigma=1e-4)))
+        for sigma in (0.001, 0.01)
+    }
+    assert [circle["fitted"] for circle in found.values()] == [False, True]
+    assert found[0.01]["radius"] == pytest.approx(0.32, abs=0.01)
+    assert np.sqrt(found[0.01]["cov"][2, 2]) > 0.02 / 3
+
+
 def test_an_inside_corner_is_no_pole() -> None:
     # Seen from inside, the arc bends the other way.
     bowl = 2.0 + 0.15 - (pole((2.0, 0.0), 0.15) - 1.85)

@@ -14,6 +14,7 @@ from linemap_jax.core.frames import reanchor
 from linemap_jax.core.lines import (
     choose_points,
     jac_line_points,
+    leave_out_arcs,
     line_from_regression,
     measure_lines,
     regress,
@@ -374,6 +375,48 @@ def test_three_points_of_two_walls_are_no_line() -> None:
         rules = Rules(leave_out_sparse=False, check_ends=rule, leave_out_ends=False)
         found = extract(scan, Pose(mean=jnp.zeros(3), cov=jnp.zeros((3, 3))), rules=rules)
         assert bool(found.lines.valid[0]) == a_line
+
+
+def front(radius: float, bearings: np.ndarray, distance: float = 2.0) -> np.ndarray:
+    """Ranges to a pole ahead; beams past it see nothing."""
+    aside = distance * np.sin(bearings)
+    met = np.abs(aside) < radius
+    return np.where(met, distance * np.cos(bearings) - np.sqrt(np.where(met, radius**2 - aside**2, 0)), np.nan)
+
+
+@pytest.mark.parametrize("rule", [True, False])
+def test_the_front_of_a_pole_is_no_line(rule: bool) -> None:
+    """Of 25 cm with 3 cm of noise, beams a degree apart: each point passes criterion 2, but all of them make an arc."""
+    bearings = np.radians(np.arange(-20.0, 21.0))
+    ranges = front(0.25, bearings)
+    noise = SensorNoise(range_sigma=0.03, bearing_sigma=0.0)
+    here = Pose(mean=jnp.zeros(3), cov=jnp.zeros((3, 3)))
+    find = partial(extract, pose=here, noise=noise, rules=Rules(leave_out_arcs=rule))
+    for scan in (Scan.from_ranges(ranges, bearings), Scan.from_ranges(ranges[::-1], bearings[::-1])):
+        found = find(scan)
+        assert int(found.circles.fitted.sum()) == rule
+        if rule:
+            assert not found.lines.valid.any()
+            np.testing.assert_allclose(found.circles.radius[0], 0.25, atol=0.02)
+    # What bends away from the scanner, or hardly, is a line; and so is what bends by no more than noise does.
+    hollow = 2 * (2 - 0.25) - ranges
+    flat = front(2.0, bearings, 4.0)
+    flat = np.where(np.abs(bearings) < np.radians(8), flat, np.nan)
+    for ranges_of, sigma in ((hollow, 0.03), (flat, 0.003), (ranges, 0.3)):
+        scan = Scan.from_ranges(ranges_of, bearings)
+        assert not is_left_out(scan, SensorNoise(range_sigma=sigma, bearing_sigma=0.0))
+    assert is_left_out(Scan.from_ranges(ranges, bearings), noise)
+
+
+def is_left_out(scan: Scan, noise: SensorNoise) -> bool:
+    """Whether all points of a scan, as one run, are left to the circles."""
+    here = Pose(mean=jnp.zeros(3), cov=jnp.zeros((3, 3)))
+    points = points_from_scan(scan, here, Mount(), jacobians="analytic")
+    count = int(points.valid.sum())
+    assert count > 5
+    left = leave_out_arcs(points, runs_at(scan.ranges.shape[0], (0, count - 1)), Thresholds(), noise)
+    np.testing.assert_array_equal(left.of_point[:count], 0 if left.valid[0] else -1)
+    return not left.valid[0]
 
 
 @pytest.mark.parametrize("count", [3, 4])

@@ -381,6 +381,26 @@ def test_circles_that_beams_passed(x: float, radius: float, gone: bool) -> None:
     assert bool(passed_circles(circles, swath, HERE.cov, Thresholds(), SensorNoise())[0]) == gone
 
 
+@pytest.mark.parametrize(
+    ("x", "known", "gone"),
+    [
+        (2.92, True, True),  # 8 cm before the wall, and depth is known to 6 cm
+        (2.92, False, False),  # what the beams measure may be the thing itself
+        (2.95, True, False),  # too near to the wall
+        (3.05, True, False),  # behind the wall
+    ],
+)
+def test_a_circle_by_a_wall_is_gone_where_beams_measure_the_wall_behind_it(x: float, known: bool, gone: bool) -> None:
+    """Of a circle of 15 cm no beam ends beyond the rim, since the wall stands in it."""
+    for ends in (([3.0, -3.0], [3.0, 3.0]), ([3.0, 3.0], [3.0, -3.0])):
+        found = lines_of(ends, capacity=1)
+        points = points_from_scan(Scan.from_ranges(WALL, BEARINGS), HERE, Mount(), jacobians="analytic")
+        own, times = jnp.array([0 if known else -1]), jnp.array([1])
+        swath = swath_jit(points, HERE, jnp.zeros(91, jnp.int32), found, own, times, Thresholds())
+        circles = circle_at(x, 0.2, 0.15)
+        assert bool(passed_circles(circles, swath, HERE.cov, Thresholds(), SensorNoise())[0]) == gone
+
+
 @pytest.mark.parametrize("n", [1000, (1 << 15) - 1, 1 << 15])
 def test_two_counts_in_one_sum(n: int) -> None:
     index = jnp.arange(n)
