@@ -567,8 +567,9 @@ def bends(sweep: Sweep, run: list[int], thresholds: Any, margin: Margin) -> bool
     design = np.stack([np.ones_like(along), along], -1)
     parabola = along**2 - design @ np.linalg.lstsq(design, along**2, rcond=None)[0]
     spread = float(parabola @ parabola)
-    curvature, cos2 = 2 * float(parabola @ depth), (sweep.u[run] @ normal) ** 2
-    variance = float(np.mean(sweep.sr**2 * cos2 + (sweep.r[run] * sweep.sa) ** 2 * (1 - cos2)))
+    curvature, halfway = 2 * float(parabola @ depth), run[(len(run) - 1) // 2]
+    cos2 = float(sweep.u[halfway] @ normal) ** 2
+    variance = sweep.sr**2 * cos2 + (sweep.r[halfway] * sweep.sa) ** 2 * (1 - cos2)
     surely = margin.below(2 * UNSURE_SIGMAS * math.sqrt(variance * spread), curvature)
     return surely and margin.below(spread, 2 * float(thresholds.cluster_distance) * curvature)
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from linemap_jax.core import circles as circles_
-from linemap_jax.core.lines import MIN_POINTS, choose_points, leave_out_arcs, length_of_run, measure_lines
+from linemap_jax.core.lines import MIN_POINTS, choose_points, length_of_run, measure_lines
 from linemap_jax.core.runs import select_runs
 from linemap_jax.core.segmentation import incremental, optimal
 from linemap_jax.core.sensor import Points, points_from_scan
@@ -230,9 +230,9 @@ def extract_points(
         few, short = ~chosen, jnp.zeros_like(chosen)
     slots = max(capacity.lines, max_vertices or 0)
     runs, lines_full = select_runs(run.n, ends & chosen & ~few & ~short, slots)
-    if rules.leave_out_arcs and max_vertices is None:
-        runs = leave_out_arcs(points, runs, thresholds, noise)
-    fitted = runs if max_vertices is not None else choose_points(points, runs, thresholds, noise, rules)
+    fitted = runs
+    if max_vertices is None:
+        runs, fitted = choose_points(points, runs, thresholds, noise, rules)
     lines, jac_line_pose, cov_measurement = measure_lines(
         points,
         pose,

@@ -21,7 +21,7 @@ from linemap_jax.core.runs import Runs
 from linemap_jax.core.segmentation.incremental import Run, gap_gate
 from linemap_jax.core.sensor import Points, cov_point
 from linemap_jax.core.settings import Covariance, Jacobians, Number, Rules, SensorNoise, Thresholds
-from linemap_jax.core.slots import bounded, earliest_true, latest_true, neutral_where_free
+from linemap_jax.core.slots import bounded, computed_once, earliest_true, latest_true, neutral_where_free
 from linemap_jax.core.state import Lines, Pose, pytree, squared
 
 MIN_POINTS = 3
@@ -314,13 +314,12 @@ def _ends(
     """
     offset, angle = line
     normal = jnp.stack([jnp.cos(angle), jnp.sin(angle)], -1)[:, None, None]
-    index = jnp.arange(runs.of_point.shape[0], dtype=jnp.int32)
-    mine = runs.of_point[None] == jnp.arange(runs.valid.shape[0], dtype=jnp.int32)[:, None]
-    first = jnp.min(jnp.where(mine, index[None], index.shape[0] - 1), -1)
-    last = jnp.max(jnp.where(mine, index[None], 0), -1)
+    of_fit, count = runs.of_point >= 0, runs.of_point.shape[0]
+    first = jnp.minimum(earliest_true(of_fit)[runs.first], count - 1)
+    last = jnp.maximum(latest_true(of_fit)[runs.last], 0)
     inward = jnp.arange(INWARD, dtype=jnp.int32)[None]
     farther = jnp.stack([runs.first[:, None] + inward, runs.last[:, None] - inward], 1)  # [K, 2, INWARD]
-    farther = jnp.clip(farther, 0, index.shape[0] - 1)
+    farther = jnp.clip(farther, 0, count - 1)
     across = dot(normal, points.position[farther] - anchor[:, None, None]) - offset[:, None, None]
     variance = _var_across(dot(normal, points.beam[farther]) ** 2, points.range[farther], noise)
     on_line = across**2 <= UNSURE_SIGMAS**2 * variance
@@ -349,27 +348,40 @@ def line_extent(
     return dot(tangent[:, None], position[ends] - anchor[:, None])
 
 
-def choose_points(points: Points, runs: Runs, thresholds: Thresholds, noise: SensorNoise, rules: Rules) -> Runs:
-    """The runs with the points that the fit should use, by the rules `leave_out_...` and `check_ends`.
+def choose_points(
+    points: Points, runs: Runs, thresholds: Thresholds, noise: SensorNoise, rules: Rules
+) -> tuple[Runs, Runs]:
+    """Which runs are lines, and which of their points the fit should use: the rules `leave_out_...` and `check_ends`.
 
     A choice that depends on the noise of the points it makes biases what is fitted to them. So it is made by where the
     line of the run, and the lines beside it, say that the points are; or by a gate that noise alone hardly ever passes.
 
     Args:
       points: the points of the scan.
-      runs: the runs that are lines, in the order of the sweep.
-      thresholds: criteria 1 and 2.
+      runs: the runs that may be lines, in the order of the sweep.
+      thresholds: criteria 1 and 2, and `cluster_distance`.
       noise: of the sensor.
       rules: which points are left out.
 
     Returns:
-      The runs; not valid where less than a third of the points, or fewer than three, are left.
+      The runs without those that the circles should have, in the same slots; and the points of them for the fit, not
+      valid where less than a third, or fewer than three, are left.
     """
-    if not (rules.leave_out_corners or rules.leave_out_sparse or rules.check_ends or rules.leave_out_ends):
-        return runs
+    if not (
+        rules.leave_out_arcs
+        or rules.leave_out_corners
+        or rules.leave_out_sparse
+        or rules.check_ends
+        or rules.leave_out_ends
+    ):
+        return runs, runs
     fit = regress(points.position, runs)
     length2 = jnp.maximum(dot(fit.direction, fit.direction), 1)
     normal = perp(fit.direction) / jnp.sqrt(length2)[:, None]
+    if rules.leave_out_arcs:
+        bent = _bent(points, runs, fit, normal, thresholds, noise)
+        of_point = jnp.where(runs.spread(bent), -1, runs.of_point)
+        runs = dataclasses.replace(runs, of_point=of_point, valid=runs.valid & ~bent)
     kept = runs.of_point >= 0
     if rules.leave_out_corners:
         kept &= ~_at_corners(points, runs, normal, fit.origin + fit.centroid, fit.count, noise)
@@ -379,48 +391,38 @@ def choose_points(points: Points, runs: Runs, thresholds: Thresholds, noise: Sen
         kept &= ~_strange_ends(points, runs, fit, normal, thresholds, noise)
     if rules.leave_out_ends:
         kept &= ~_near_ends(points, runs, fit.count, thresholds, noise)
+    kept = computed_once(lambda x: x, kept)  # many kernels read it
     count = runs.sum(kept.astype(fit.count.dtype))
     valid = runs.valid & _enough(count, fit.count)
-    return dataclasses.replace(runs, of_point=jnp.where(kept, runs.of_point, -1), valid=valid)
+    return runs, dataclasses.replace(runs, of_point=jnp.where(kept, runs.of_point, -1), valid=valid)
 
 
-def leave_out_arcs(points: Points, runs: Runs, thresholds: Thresholds, noise: SensorNoise) -> Runs:
-    """The runs without those that bend as a pole does; their points are left to the circles.
+def _bent(
+    points: Points, runs: Runs, fit: Regression, normal: Float[Array, "K 2"], thresholds: Thresholds, noise: SensorNoise
+) -> Bool[Array, " K"]:
+    """The runs that bend as a pole does.
 
     The gate of criterion 2 is five sigma wide. With noise of 2 cm the front of a pole of 20 cm passes it, point by
-    point; all points together tell. A run goes if the parabola through it bulges towards the scanner, surely so, and no
-    flatter than a circle of twice the largest radius that is fitted. What is told by residuals from the line has no
-    part in the line, so that walls that go by mistake do not bias those that stay.
-
-    Args:
-      points: the points of the scan.
-      runs: the runs that may be lines.
-      thresholds: `cluster_distance`, the largest radius.
-      noise: of the sensor.
-
-    Returns:
-      The runs, fewer, in the same slots.
+    point; all points together tell. A run bends if the parabola through it bulges towards the scanner, surely so, and
+    is no flatter than a circle of twice the largest radius that is fitted. What is told by residuals from the line has
+    no part in the line, so that walls that go by mistake do not bias those that stay.
     """
-    fit = regress(points.position, runs)
-    tangent = fit.direction / jnp.sqrt(dot(fit.direction, fit.direction))[:, None]
     middle = fit.origin + fit.centroid
-    ahead = dot(perp(tangent), middle - points.laser[None]) > 0
-    away = jnp.where(ahead, 1, -1)[:, None] * perp(tangent)
-    mine = runs.spread(jnp.concatenate([tangent, away, middle], -1))
-    from_middle = points.position - mine[:, 4:]
-    along, depth = dot(mine[:, :2], from_middle), dot(mine[:, 2:4], from_middle)
-    variance = _var_across(dot(mine[:, 2:4], points.beam) ** 2, points.range, noise)
+    away = jnp.where(dot(normal, middle - points.laser[None]) > 0, 1, -1)[:, None] * normal
+    mine = runs.spread(jnp.concatenate([away, middle], -1))
+    from_middle = points.position - mine[:, 2:]
+    along, depth = dot(perp(mine[:, :2]), from_middle), dot(mine[:, :2], from_middle)
     square = along * along
-    columns = [square, square * along, square * square, along * depth, square * depth, variance]
-    s2, s3, s4, along_depth, square_depth, variance = jnp.moveaxis(runs.sum(jnp.stack(columns, -1)), -1, 0)
+    columns = [square, square * along, square * square, along * depth, square * depth]
+    s2, s3, s4, along_depth, square_depth = jnp.moveaxis(runs.sum(jnp.stack(columns, -1)), -1, 0)
     # The square of the distance along the line, less the line through that, regressed on the depth
     skew = s3 / jnp.where(s2 > 0, s2, 1)
     spread = s4 - s2 * s2 / fit.count - s3 * skew
     bulge = square_depth - skew * along_depth
-    surely = (bulge > 0) & (bulge * bulge > UNSURE_SIGMAS**2 * variance / fit.count * spread)
-    bent = surely & (4 * thresholds.cluster_distance * bulge > spread)
-    of_point = jnp.where((runs.of_point >= 0) & runs.spread(bent), -1, runs.of_point)
-    return dataclasses.replace(runs, of_point=of_point, valid=runs.valid & ~bent)
+    halfway = (runs.first + runs.last) // 2
+    variance = _var_across(dot(away, points.beam[halfway]) ** 2, points.range[halfway], noise)
+    surely = (bulge > 0) & (bulge * bulge > UNSURE_SIGMAS**2 * variance * spread)
+    return runs.valid & surely & (4 * thresholds.cluster_distance * bulge > spread)
 
 
 def _at_corners(

@@ -14,7 +14,6 @@ from linemap_jax.core.frames import reanchor
 from linemap_jax.core.lines import (
     choose_points,
     jac_line_points,
-    leave_out_arcs,
     line_from_regression,
     measure_lines,
     regress,
@@ -321,7 +320,7 @@ def test_a_line_that_began_on_the_wall_beside_leaves_its_points_out(first: int, 
     noise = SensorNoise(range_sigma=0.02, bearing_sigma=0.0)
     rules = Rules(leave_out_sparse=False, check_ends=False, leave_out_ends=False)
     choose = jax.jit(choose_points, static_argnames="rules")
-    found = choose(points, runs_at(41, (0, first - 1), (first, last)), Thresholds(), noise, rules=rules)
+    _, found = choose(points, runs_at(41, (0, first - 1), (first, last)), Thresholds(), noise, rules=rules)
     np.testing.assert_array_equal(np.flatnonzero(np.asarray(found.of_point) == 1), range(keeps_from, last + 1))
     assert found.valid[1]
 
@@ -335,7 +334,7 @@ def test_points_that_noise_may_have_brought_from_the_wall_beside_are_left_out() 
     noise = SensorNoise(range_sigma=0.05, bearing_sigma=0.0)
     rules = Rules(leave_out_sparse=False, leave_out_ends=False)
     choose = jax.jit(choose_points, static_argnames="rules")
-    kept = choose(points, runs_at(41, (0, 20), (21, 40)), Thresholds(), noise, rules=rules)
+    _, kept = choose(points, runs_at(41, (0, 20), (21, 40)), Thresholds(), noise, rules=rules)
     x, y = np.asarray(points.position).T
     beside = np.abs(3 - x + np.where(np.arange(41) <= 20, -y, y)) / np.sqrt(2)
     unsure = beside < 3 * 0.05 * np.cos(np.pi / 4 + np.abs(bearings))
@@ -356,7 +355,7 @@ def test_a_point_at_the_end_that_the_others_disagree_with_is_left_out(moved: int
     sigma = 0.012
     choose = jax.jit(choose_points, static_argnames="rules")
     noise = SensorNoise(range_sigma=sigma, bearing_sigma=0.0)
-    found = choose(points, runs_at(7, (0, 6)), Thresholds(), noise, rules=Rules(leave_out_ends=False))
+    _, found = choose(points, runs_at(7, (0, 6)), Thresholds(), noise, rules=Rules(leave_out_ends=False))
     others = np.delete(np.arange(7), moved or 0)
     u = 10 * np.tan(bearings)
     predicted = sigma * np.sqrt(
@@ -414,7 +413,7 @@ def is_left_out(scan: Scan, noise: SensorNoise) -> bool:
     points = points_from_scan(scan, here, Mount(), jacobians="analytic")
     count = int(points.valid.sum())
     assert count > 5
-    left = leave_out_arcs(points, runs_at(scan.ranges.shape[0], (0, count - 1)), Thresholds(), noise)
+    left, _ = choose_points(points, runs_at(scan.ranges.shape[0], (0, count - 1)), Thresholds(), noise, Rules())
     np.testing.assert_array_equal(left.of_point[:count], 0 if left.valid[0] else -1)
     return not left.valid[0]
 
@@ -451,7 +450,7 @@ def test_points_near_the_ends_are_left_out_where_enough_are_left(
     noise = SensorNoise(range_sigma=0.02, bearing_sigma=0.0)
     choose = jax.jit(choose_points, static_argnames="rules")
     rules = Rules(leave_out_sparse=False)
-    found = choose(points, runs_at(count, (0, count - 1)), Thresholds(), noise, rules=rules)
+    _, found = choose(points, runs_at(count, (0, count - 1)), Thresholds(), noise, rules=rules)
     assert found.valid[0]
     np.testing.assert_array_equal(np.flatnonzero(np.asarray(found.of_point) < 0), left_out)
 
