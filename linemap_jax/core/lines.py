@@ -511,7 +511,7 @@ def _near_ends(
     Past an end of a wall criterion 2 lets points of what stands across it pass, until they are as far away as it
     reaches. One scan hardly shows it, but fifty scans from one side all err alike. So whoever they are, what is as near
     as that to the first or last point of a run is left out, while enough are left; and the first and the last one
-    always: of a wall that four beams meet, one in three lines had a point of what stands across it. Who decides by
+    always: one point of what stands across turns a line of three or four beams, and does not show. Who decides by
     residuals keeps those that noise has moved to the line.
     """
     index = jnp.arange(runs.of_point.shape[0], dtype=jnp.int32)
