@@ -90,7 +90,8 @@ class Localize(LogOptions):
         write_tum(tum, way.timestamps, way.means, overwrite=self.overwrite)
         write_covariances(beside, way.timestamps, way.means, way.covs, way.lost, overwrite=self.overwrite)
         if in_folder:
-            plot_map(picture, line_map, way.means[:, :2], title=self.log.name, overwrite=self.overwrite)
+            path, title = way.means[:, :2], self.log.name
+            plot_map(picture, line_map, path, lost=path[way.lost], title=title, overwrite=self.overwrite)
         if way.interrupted:
             print(f"linemap: interrupted; the trajectory so far is in {tum}", file=sys.stderr)
             return 130

@@ -37,6 +37,7 @@ SOFT = "#6B6B6B"
 GRID = "#E6E6E6"
 UNCERTAIN = "#E69F00"  # the orange of Okabe and Ito
 ROBOT = "#8A8A8A"
+LOST = "#D55E00"  # their vermilion
 BLUES = ListedColormap(mpl.colormaps["Blues"](np.linspace(0.45, 1.0, 256)))
 STYLE = {
     "axes.axisbelow": True,
@@ -64,6 +65,7 @@ def plot_map(
     line_map: LineMap,
     trajectory: ArrayLike | None = None,
     *,
+    lost: ArrayLike | None = None,
     title: str,
     level: float = 0.95,
     overwrite: bool = False,
@@ -74,6 +76,7 @@ def plot_map(
       path: of the picture.
       line_map: the map.
       trajectory: positions of the robot in metres, shape `[T, 2]`, or None. Rows that are not finite are left out.
+      lost: those of them where it did not know where it was, shape `[M, 2]`, or None.
       title: stands above the map, as it is.
       level: probability of the confidence bands and ellipses, in (0, 1).
       overwrite: whether an older file may be replaced.
@@ -83,10 +86,17 @@ def plot_map(
       ValueError: if the level is not in (0, 1) or the trajectory is not of shape `[T, 2]`.
     """
     with atomic_write(path, overwrite=overwrite) as temporary:
-        draw_map(line_map, trajectory, title=title, level=level).savefig(temporary, format="png", dpi=DPI)
+        draw_map(line_map, trajectory, lost=lost, title=title, level=level).savefig(temporary, format="png", dpi=DPI)
 
 
-def draw_map(line_map: LineMap, trajectory: ArrayLike | None = None, *, title: str, level: float = 0.95) -> Figure:
+def draw_map(
+    line_map: LineMap,
+    trajectory: ArrayLike | None = None,
+    *,
+    lost: ArrayLike | None = None,
+    title: str,
+    level: float = 0.95,
+) -> Figure:
     """The picture of `plot_map` as a figure, to show or to save otherwise; pyplot does not know of it.
 
     Raises:
@@ -114,7 +124,7 @@ def draw_map(line_map: LineMap, trajectory: ArrayLike | None = None, *, title: s
     if circles.valid.size:
         legend.append(_draw_circles(axes, circles, colour, level))
     if len(path):
-        legend.append(_draw_path(axes, path))
+        legend.append(_draw_path(axes, path, finite_path(lost)))
     beside = _lay_out(figure, axes, frame, legend)
     if times.size:
         _draw_colour_bar(figure, beside, colour, most)
@@ -218,15 +228,18 @@ def _round_handle(face: Any, edge: Any, label: str) -> Line2D:
     return Line2D([], [], linestyle="none", marker="o", markersize=7, mfc=face, mec=edge, mew=0.9, label=label)
 
 
-def _draw_path(axes: Axes, path: Floats) -> list[Any]:
-    """Where the robot drove; returns what the legend shows."""
+def _draw_path(axes: Axes, path: Floats, lost: Floats) -> list[Any]:
+    """Where the robot drove, and was lost; returns what the legend shows."""
     (driven,) = axes.plot(
         *path.T, color=ROBOT, linewidth=0.9, linestyle=(0, (4, 1.5)), label="path of the robot", zorder=3
     )
     style = {"linestyle": "none", "markersize": 6, "markeredgecolor": INK, "markeredgewidth": 1.0, "zorder": 6}
     (start,) = axes.plot(*path[0], marker="o", markerfacecolor="white", label="start", **style)
     (end,) = axes.plot(*path[-1], marker="s", markerfacecolor=INK, label="end", **style)
-    return [driven, start, end]
+    if not len(lost):
+        return [driven, start, end]
+    (astray,) = axes.plot(*lost.T, color=LOST, linestyle="none", marker=".", markersize=3, label="robot lost", zorder=4)
+    return [driven, astray, start, end]
 
 
 def _lay_out(figure: Figure, axes: Axes, frame: _Frame, legend: list[list[Any]]) -> Axes:

@@ -97,6 +97,17 @@ def test_writes_a_png(tmp_path: Path) -> None:
     plot_map(path, some_map(), title="another map", overwrite=True)
 
 
+def test_the_picture_shows_where_the_robot_was_lost() -> None:
+    path = np.cumsum(np.ones((20, 2)) * 0.3, 0)
+    for lost, told in ((path[5:9], True), (path[:0], False), (None, False)):
+        figure = draw_map(some_map(), path, lost=lost, title="a map")
+        assert ("robot lost" in words(figure)) == told
+        shown = [line for line in figure.axes[0].lines if line.get_label() == "robot lost"]
+        assert len(shown) == told
+        for line in shown:
+            np.testing.assert_array_equal(np.stack(line.get_data(), -1), lost)
+
+
 @pytest.mark.parametrize(("width", "height"), [(5, 3), (3, 5), (100, 70), (100, 2), (2, 100), (0.2, 0.2)])
 def test_equal_axes_in_a_figure_of_the_shape_of_the_map(width: float, height: float) -> None:
     figure = draw_map(box(width, height), title="a box")
