@@ -137,7 +137,7 @@ def test_other_settings_are_told() -> None:
     assert differences(*mounts) == "mount.x 0.0 (now 0.18)"
     assert differences({"slam": {}} | mounts[0], mounts[1]) == ""
     assert differences(before | {"rules": PAPER_RULES}, now).endswith(
-        "rules.maximum_likelihood False (now True) and 12 more"
+        "rules.maximum_likelihood False (now True) and 13 more"
     )
 
 
@@ -257,6 +257,26 @@ def test_which_log_would_tell_more_is_told_once() -> None:
     assert told.count("--log-b tells what is gone from what the second drive did not look at") == 1
     assert "--log-a" not in told  # that log has been asked
     assert "--log-b" not in _in_words(Comparison([new], 0, 0, 0))
+
+
+def test_what_the_beams_do_not_bear_out_is_counted_alone() -> None:
+    line = Change(
+        what="appeared", kind="line", slot_a=None, slot_b=0, begin=(0, 0), end=(1, 0), radius=None, times_detected=5
+    )
+    circle = dataclasses.replace(line, kind="circle", end=(0, 0), radius=0.1)
+    for change, passed, met, passed_own, met_own, sure in (
+        (line, 6, 5, 5, 5, True),
+        (line, 5, 5, 0, 9, False),
+        (line, 6, 5, 6, 5, False),  # its own beams went through as well
+        (circle, 46, 5, 0, 9, True),
+        (circle, 45, 5, 0, 9, False),
+        (circle, 46, 5, 10, 9, False),
+        (circle, 46, 5, None, None, True),
+    ):
+        asked = dataclasses.replace(change, passed=passed, met=met, passed_own=passed_own, met_own=met_own)
+        told = _in_words(Comparison([asked], 0, 0, 0))
+        assert ("beams of the other drive went through" in told) == sure
+        assert ("1 more are in one map only" in told) == (not sure)
 
 
 def test_what_is_refused(built: Path, refuse: Any, tmp_path: Path) -> None:

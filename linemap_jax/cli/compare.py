@@ -4,7 +4,7 @@ import dataclasses
 import json
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -21,6 +21,8 @@ ASK: "dict[What, str]" = {
     "appeared": "--log-a tells what is new from what the first drive did not look at",
 }
 """What to do about changes that no log bears out."""
+WENT_THROUGH = {"line": 1, "circle": 9}
+"""So many times as many beams as ended there: past the corner of a wall, beams go through a circle that is there."""
 MOST_TOLD = 15
 """Changes of a kind that are told in words; --json tells all."""
 
@@ -35,9 +37,11 @@ class Compare(LogInput):
     b: tyro.conf.Positional[Path]
     """The map after, of another drive."""
     log_a: Annotated[Path | None, tyro.conf.arg(metavar="LOG")] = None
-    """Log of the map before: whether its beams went through where something has appeared."""
+    """Log of the map before: whether its beams went through where something has appeared, and whether they met what has
+    vanished."""
     log_b: Annotated[Path | None, tyro.conf.arg(metavar="LOG")] = None
-    """Log of the map after: whether its beams went through where something has vanished, or did not look there."""
+    """Log of the map after: whether its beams went through where something has vanished, or did not look there, and
+    whether they met what has appeared."""
     poses_a: Annotated[Path | None, tyro.conf.arg(metavar="FILE.tum")] = None
     """Poses for the log of the map before, in place of those that it states; of the robot, or, if a comment in the file
     says so, of the laser."""
@@ -51,7 +55,7 @@ class Compare(LogInput):
     shortest: Annotated[float, tyro.conf.arg(metavar="M")] = 0.5
     """Shortest piece of a line that is told to have vanished or appeared, m."""
     at_least: Annotated[int, tyro.conf.arg(metavar="N")] = 3
-    """Lines and circles that were detected more seldom are passed over."""
+    """Of lines and circles that were detected more seldom no change is told."""
     quiet: bool = False
     """No progress, no warnings."""
     json: bool = False
@@ -78,12 +82,12 @@ class Compare(LogInput):
         alike = agreement(a, b)
         warn_of_frames(self.a, self.b, alike, quiet=self.quiet)
         found = compare_maps(a, b, **options)
-        logs: list[tuple[What, Path | None, Path | None]] = [
-            ("appeared", self.log_a, self.poses_a),
-            ("vanished", self.log_b, self.poses_b),
+        logs: list[tuple[Literal["before", "after"], Path | None, Path | None]] = [
+            ("before", self.log_a, self.poses_a),
+            ("after", self.log_b, self.poses_b),
         ]
         maps = zip((self.a, self.b), (a, b), settings, strict=True)
-        for (what, path, poses), (map_file, line_map, of_map) in zip(logs, maps, strict=True):
+        for (drive, path, poses), (map_file, line_map, of_map) in zip(logs, maps, strict=True):
             if path is not None:
                 command = dataclasses.replace(self, poses=poses)
                 command = at_poses_of_map(command, path, map_file, of_map, quiet=self.quiet)
@@ -91,7 +95,7 @@ class Compare(LogInput):
                 mount = mount_of(command, log, quiet=self.quiet)
                 fit = Fit(line_map, mount)
                 with progress(log, quiet=self.quiet):
-                    changes = looked_through(found.changes, fit.through(plain_chunks(log)), what, mount, chunk=CHUNK)
+                    changes = looked_through(found.changes, fit.through(plain_chunks(log)), drive, mount, chunk=CHUNK)
                 found = found._replace(changes=changes)
                 warn(log, quiet=self.quiet)
                 fit.warn(log, map_file, quiet=self.quiet)
@@ -135,14 +139,16 @@ def _in_words(found: "Comparison") -> str:
         if what in ASK and any(change.passed is None for change in changes):
             said.append(f"  {ASK[what]}")
         if len(changes) > len(sure):
-            more = f"{len(changes) - len(sure)} more are in one map only, but the other drive did not see through"
-            said.append(f"  {more}; --json tells where")
+            why = "but the other drive did not see through, or its own did"
+            said.append(f"  {len(changes) - len(sure)} more are in one map only, {why}; --json tells where")
     return "\n".join(said)
 
 
 def _borne_out(change: "Change") -> bool:
-    """Where a log of the other drive was asked, most of its beams went through."""
-    return change.passed is None or change.met is None or change.passed > change.met
+    """Where the logs were asked, the beams of the other drive went through it, and most of its own did not."""
+    through = change.passed is None or change.met is None or change.passed > WENT_THROUGH[change.kind] * change.met
+    seen = change.passed_own is None or change.met_own is None or change.met_own >= change.passed_own
+    return through and seen
 
 
 def _told(change: "Change") -> str:

@@ -13,7 +13,6 @@ from linemap_jax.cli.options import LogInput, UsageError, check_input, own_optio
 from linemap_jax.cli.output import check_output, make_folder, say
 
 if TYPE_CHECKING:
-    from linemap_jax.core.state import LineMap
     from linemap_jax.io.reading import Log
 
 FormatName = Literal["json", "geojson", "svg", "dxf", "nav2", "mcap", "tum", "png", "html"]
@@ -63,11 +62,12 @@ class Export(LogInput):
 
         jax.config.update("jax_enable_x64", True)
         keep_compilations()
+        from linemap_jax.core.slots import detected_often
         from linemap_jax.io.map_file import read_map
 
         line_map, settings = read_map(self.map)
         if self.at_least > 1:
-            line_map, settings = _often(line_map, self.at_least), {**settings, "at_least": self.at_least}
+            line_map, settings = detected_often(line_map, self.at_least), {**settings, "at_least": self.at_least}
         added: dict[str, Any] = {}
         if self.log is not None and name not in ("json", "geojson"):
             command = at_poses_of_map(self, self.log, self.map, settings, quiet=self.quiet)
@@ -83,17 +83,6 @@ class Export(LogInput):
         FORMATS[name].write(self.output, content, self.overwrite)
         say(f"{self.map} -> {self.output} ({name})", quiet=self.quiet)
         return 0
-
-
-def _often(line_map: "LineMap", times: int) -> "LineMap":
-    """What of a map was detected so many times."""
-    from linemap_jax.core.slots import neutral_where_free
-    from linemap_jax.core.state import LineMap
-
-    lines, circles = line_map.lines, line_map.circles
-    lines = dataclasses.replace(lines, valid=lines.valid & (lines.times_detected >= times))
-    circles = dataclasses.replace(circles, valid=circles.valid & (circles.times_detected >= times))
-    return LineMap(lines=neutral_where_free(lines), circles=neutral_where_free(circles))
 
 
 def _read(command: Export, log: "Log", name: str, fit: Fit) -> dict[str, Any]:

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from linemap_jax.core.frames import unit
-from linemap_jax.core.state import DirectedLines, Lines, SlotsT, empty_circles, empty_lines
+from linemap_jax.core.state import DirectedLines, LineMap, Lines, SlotsT, empty_circles, empty_lines
 
 
 def first_true(which: Bool[Array, " K"]) -> Int[Array, ""]:
@@ -118,6 +118,22 @@ def directed(lines: Lines) -> DirectedLines:
 def neutral_where_free(slots: SlotsT) -> SlotsT:
     """The same `slots` of lines or circles with neutral values in the free ones: nothing non-finite lurks there."""
     return choose(slots.valid, slots, _empty_like(slots, slots.valid.shape[0]))
+
+
+def detected_often(line_map: LineMap, times: int) -> LineMap:
+    """What of a map was detected often.
+
+    Args:
+      line_map: the map.
+      times: in so many scans, at least.
+
+    Returns:
+      The map without the rest, in the same slots.
+    """
+    lines, circles = line_map.lines, line_map.circles
+    lines = dataclasses.replace(lines, valid=lines.valid & (lines.times_detected >= times))
+    circles = dataclasses.replace(circles, valid=circles.valid & (circles.times_detected >= times))
+    return LineMap(lines=neutral_where_free(lines), circles=neutral_where_free(circles))
 
 
 LARGEST = 1e9

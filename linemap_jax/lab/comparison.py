@@ -8,7 +8,8 @@ chance; so p-values are those of Holm (1979), and the probability that any chang
 at most `alpha`.
 
 Nothing on the other map is no proof that nothing is there: the robot may not have looked. That takes the log of the
-other map, see `looked_through`.
+other map, see `looked_through`. Nor is something on a map proof that a thing was there: points that no line took are
+clusters too. Beams of its own drive tell.
 """
 
 import dataclasses
@@ -25,6 +26,7 @@ from linemap_jax.core.fields import documented
 from linemap_jax.core.frames import dot, unit
 from linemap_jax.core.matching import LineComparison, compare_lines, normal_variance
 from linemap_jax.core.settings import Mount, Thresholds
+from linemap_jax.core.slots import detected_often
 from linemap_jax.core.state import LineMap, Lines, Pose, Scan, pad_stack
 from linemap_jax.lab.raycast import cast
 from linemap_jax.lab.world import NEVER, Kind, Poles, Segments, World
@@ -40,6 +42,9 @@ END_SIGMAS = 3.0
 END_SLACK = 0.1
 """m. How far the ends of one wall may lie apart in two maps beside that: a corner is rounded by some beams."""
 
+APART = 0.1
+"""m. Circles without a covariance are the same thing if their discs are no farther apart: the centre of what is visible
+moves with the viewpoint, by as much as the thing is thick."""
 BESIDE = 0.1
 """m. A line that is no farther from a longer one, all along, is a piece of it."""
 REACH = 1.0
@@ -83,6 +88,10 @@ class Change:
     """Beams of the other map's log that went through where it was or is; None without a log."""
     met: int | None = None
     """Beams of the other map's log that ended there."""
+    passed_own: int | None = None
+    """Beams of the log of the map that holds it that went through it; None without a log."""
+    met_own: int | None = None
+    """Beams of that log that ended there."""
 
 
 @documented
@@ -116,7 +125,8 @@ def compare_maps(
       within: how far a thing may have moved, m; farther away it is another one.
       alpha: probability of telling of a movement where there is none.
       shortest: shortest piece of a line that is told to have vanished or appeared, m.
-      at_least: changes of lines and circles that were detected more seldom are not told.
+      at_least: of lines and circles that were detected more seldom no change is told; they only count for what is
+        where it was.
 
     Returns:
       The changes: what has moved, most surely first; what has vanished and what has appeared, the longest first.
@@ -124,7 +134,7 @@ def compare_maps(
     lines_a, lines_b = (_Walls(*map(np.asarray, _walls(m.lines))) for m in (a, b))
     pairs = _line_pairs(a.lines, b.lines, lines_a, lines_b, within)
     circle_pairs = _circle_pairs(a, b, within)
-    # One family of tests. Of circles without a covariance those near each other are the same.
+    # One family of tests. Circles without a covariance that are near each other are the same.
     fitted = circle_pairs.near & ~np.isnan(circle_pairs.p)
     raw = np.concatenate([pairs.p[pairs.near], circle_pairs.p[fitted]])
     p_line, p_circle = np.ones(pairs.near.shape), np.ones(fitted.shape)
@@ -133,7 +143,11 @@ def compare_maps(
     same = pairs.near & (p_line >= alpha)
     on_a, on_b = (_lie_on(walls).astype(np.float32) for walls in (lines_a, lines_b))  # products of bool are slow
     held = on_a @ same.astype(np.float32) @ on_b.T > 0
-    free_a, free_b = (np.flatnonzero(x) for x in (lines_a.valid & ~held.any(1), lines_b.valid & ~held.any(0)))
+    # What was seen seldom may bear out that a thing is where it was; it is not where another thing has gone.
+    free_a, free_b = (
+        np.flatnonzero(walls.valid & (walls.times >= at_least) & ~held.any(axis))
+        for walls, axis in ((lines_a, 1), (lines_b, 0))
+    )
     moved = list(_nearest_first(np.where(pairs.near, pairs.nis, np.inf), free_a, free_b))
     slide, p_slide = _slides(lines_a, lines_b, same)
     slid = [(int(i), int(j)) for i, j in np.argwhere(p_slide < alpha)]
@@ -147,7 +161,7 @@ def compare_maps(
     moved_a, moved_b = ({at[side] for at in moved + slid} for side in (0, 1))
     changes += _missing_lines("vanished", lines_a, lines_b, held, moved_a, shortest)
     changes += _missing_lines("appeared", lines_b, lines_a, held.T, moved_b, shortest)
-    found, same_circles = _circle_changes(a, b, circle_pairs, p_circle, alpha)
+    found, same_circles = _circle_changes(a, b, circle_pairs, p_circle, alpha, at_least)
     changes = [change for change in changes + found if change.times_detected >= at_least]
     order = {"moved": 0, "vanished": 1, "appeared": 2}
 
@@ -200,13 +214,13 @@ def holm(p: Float[np.ndarray, " M"]) -> Float[np.ndarray, " M"]:
 def looked_through(
     changes: list[Change],
     chunks: Iterable[tuple[Scan, Pose]],
-    what: What,
+    drive: Literal["before", "after"],
     mount: Mount | None = None,
     *,
     chunk: int,
     slack: float = 0.15,
 ) -> list[Change]:
-    """The changes, with what the beams of a log say of what has vanished (the log of the map after) or has appeared.
+    """The changes, with what the beams of a log say of what has vanished and of what has appeared.
 
     A beam that ends `slack` behind the place of a thing has passed through it; one that ends there has met something.
     Of one that ends before it, nothing follows.
@@ -214,30 +228,53 @@ def looked_through(
     Args:
       changes: of `compare_maps`.
       chunks: stacked scans and poses, at most `chunk` of them each time.
-      what: which of the changes: "vanished" or "appeared".
+      drive: of which map the log is. That after tells whether what has vanished is gone, and whether what has appeared
+        is a thing at all; that before the other way round.
       mount: of the scanner on the robot.
       chunk: size to which pieces are filled up.
       slack: m.
 
     Returns:
-      The same changes, those in question with `passed` and `met`.
+      The same changes: those that are in the other map alone with `passed` and `met`, those that are in the map of this
+      drive alone with `passed_own` and `met_own`.
     """
-    meant = [i for i, change in enumerate(changes) if change.what == what]
-    lines = [i for i in meant if changes[i].kind == "line"]
-    circles = [i for i in meant if changes[i].kind == "circle"]
-    world = _world([changes[i] for i in lines], [changes[i] for i in circles])
-    room = world.segments.valid.shape[0]
-    passed, met = (np.zeros(room + world.poles.valid.shape[0], int) for _ in range(2))
+    other, own = ("vanished", "appeared") if drive == "after" else ("appeared", "vanished")
+    asked = [_Asked.of(changes, what) for what in (other, own)]
     for scans, poses in chunks:
         active = np.arange(chunk) < scans.ranges.shape[0]
         scans, poses = pad_stack(scans, chunk), pad_stack(poses, chunk)
         scans = dataclasses.replace(scans, valid=jnp.asarray(np.asarray(scans.valid) & active[:, None]))
-        beyond, at = _beams_at(world, scans, poses, mount or Mount(), slack)
-        passed, met = passed + np.asarray(beyond), met + np.asarray(at)
+        for things in asked:
+            things.count(*_beams_at(things.world, scans, poses, mount or Mount(), slack))
     told = list(changes)
-    for where, i in (*enumerate(lines), *((room + k, i) for k, i in enumerate(circles))):
-        told[i] = dataclasses.replace(changes[i], passed=int(passed[where]), met=int(met[where]))
+    for things, names in zip(asked, (("passed", "met"), ("passed_own", "met_own")), strict=True):
+        for where, i in things.index:
+            counts = {name: int(beams[where]) for name, beams in zip(names, things.beams, strict=True)}
+            told[i] = dataclasses.replace(changes[i], **counts)
     return told
+
+
+@dataclasses.dataclass
+class _Asked:
+    """Changes of one kind as a world, and how many beams passed through each of them or ended there."""
+
+    world: World
+    index: list[tuple[int, int]]  # of each change: its place in the world, its place among the changes
+    beams: tuple[Int[np.ndarray, " M"], Int[np.ndarray, " M"]]
+
+    @classmethod
+    def of(cls, changes: list[Change], what: What) -> "_Asked":
+        meant = [i for i, change in enumerate(changes) if change.what == what]
+        lines = [i for i in meant if changes[i].kind == "line"]
+        circles = [i for i in meant if changes[i].kind == "circle"]
+        world = _world([changes[i] for i in lines], [changes[i] for i in circles])
+        room = world.segments.valid.shape[0]
+        index = [*enumerate(lines), *((room + k, i) for k, i in enumerate(circles))]
+        size = room + world.poles.valid.shape[0]
+        return cls(world, index, (np.zeros(size, int), np.zeros(size, int)))
+
+    def count(self, passed: Array, met: Array) -> None:
+        self.beams = self.beams[0] + np.asarray(passed), self.beams[1] + np.asarray(met)
 
 
 class _Walls(NamedTuple):
@@ -452,7 +489,9 @@ def _circle_pairs(a: LineMap, b: LineMap, within: float) -> _CirclePairs:
     distance = np.linalg.norm(shift, axis=-1)
     fitted = np.asarray(one.fitted)[:, None] & np.asarray(other.fitted)[None]
     near = np.asarray(one.valid)[:, None] & np.asarray(other.valid)[None]
-    near = near & (distance <= np.where(fitted, within, Thresholds().circle_match_distance))
+    radii = np.asarray(one.radius, float)[:, None] + np.asarray(other.radius, float)[None]
+    alike = np.minimum(radii + APART, Thresholds().circle_match_distance)
+    near = near & (distance <= np.where(fitted, within, alike))
     cov = np.asarray(one.cov, float)[:, None, :2, :2] + np.asarray(other.cov, float)[None, :, :2, :2]
     cov = np.where((near & fitted)[..., None, None], cov, np.eye(2))
     nis = np.einsum("cdi,cdi->cd", shift, np.linalg.solve(cov, shift[..., None])[..., 0])
@@ -462,11 +501,14 @@ def _circle_pairs(a: LineMap, b: LineMap, within: float) -> _CirclePairs:
 
 
 def _circle_changes(
-    a: LineMap, b: LineMap, pairs: _CirclePairs, p: Float[np.ndarray, "C D"], alpha: float
+    a: LineMap, b: LineMap, pairs: _CirclePairs, p: Float[np.ndarray, "C D"], alpha: float, at_least: int
 ) -> tuple[list[Change], int]:
     """What has become of the circles; and how many of the first map the second holds too."""
     same = pairs.near & (p >= alpha)
-    free = [np.flatnonzero(np.asarray(m.circles.valid) & ~same.any(axis)) for m, axis in ((a, 1), (b, 0))]
+    free = [
+        np.flatnonzero(np.asarray(detected_often(m, at_least).circles.valid) & ~same.any(axis))
+        for m, axis in ((a, 1), (b, 0))
+    ]
     moved = list(_nearest_first(np.where(pairs.near, np.linalg.norm(pairs.shift, axis=-1), np.inf), *free))
     changes = []
     parts: list[tuple[What, LineMap, list[int]]] = [

@@ -174,6 +174,27 @@ def test_what_was_seen_once_is_passed_over() -> None:
     before, after = seen(box(0, 0), times=2), seen(seed=1)
     assert len(told(compare_maps(before, after), "vanished")) == 4
     assert compare_maps(before, after, at_least=3).changes == []
+    # It takes no partner away either: a line seen once, nearer to where a wall was than where the wall is now.
+    wall, now, stray = (lines_between([[(-1.0, y), (1.0, y)]], times=n) for y, n in ((0.0, 9), (0.3, 9), (0.2, 1)))
+    both = jax.tree.map(lambda x, y: jnp.concatenate([x[:1], y[:1]]), now, stray)
+    before, after = (LineMap(lines=x, circles=poles_at([])) for x in (wall, both))
+    for at_least, slot in ((1, 1), (2, 0)):
+        (moved,) = told(compare_maps(before, after, at_least=at_least), "moved")
+        assert moved.slot_b == slot
+
+
+@pytest.mark.parametrize(("apart", "radius", "same"), [(0.19, 0.05, True), (0.21, 0.05, False), (0.31, 0.2, False)])
+def test_circles_without_a_covariance_are_the_same_if_their_discs_are_near(
+    apart: float, radius: float, same: bool
+) -> None:
+    maps = []
+    for x in (0.0, apart):
+        circles = poles_at([(x, 0.0, radius)])
+        circles = dataclasses.replace(circles, fitted=jnp.zeros_like(circles.fitted))
+        maps.append(LineMap(lines=lines_between([]), circles=circles))
+    found = compare_maps(*maps)
+    assert found.same_circles == same
+    assert [change.what for change in found.changes] == ([] if same else ["vanished", "appeared"])
 
 
 def test_holm() -> None:
@@ -191,7 +212,7 @@ def test_beams_tell_what_has_vanished_from_what_was_not_looked_at() -> None:
     scan = Scan.from_ranges(ranges, bearings)
     scans = jax.tree.map(lambda x: x[None], scan)
     poses = Pose(mean=jnp.zeros((1, 3)), cov=jnp.zeros((1, 3, 3)))
-    asked = looked_through(changes, [(scans, poses), (scans, poses)], "vanished", chunk=2)
+    asked = looked_through(changes, [(scans, poses), (scans, poses)], "after", chunk=2)
     assert [change.slot_a for change in asked] == [change.slot_a for change in changes]
 
     def beams(change: Change) -> tuple[int | None, int | None]:
@@ -212,5 +233,16 @@ def test_beams_tell_what_has_vanished_from_what_was_not_looked_at() -> None:
     # A scan of a room in which the near side is still there
     there = np.where(np.abs(np.tan(bearings)) < 0.25, 2 / np.cos(bearings), ranges)
     scans = dataclasses.replace(scans, ranges=jnp.asarray(there)[None])
-    asked = looked_through(changes, [(scans, poses)], "vanished", chunk=2)
+    asked = looked_through(changes, [(scans, poses)], "after", chunk=2)
     assert next(beams(change) for change in asked if change.slot_a == 7 and change.kind == "line") == (0, at_side.sum())
+    # Of the drive before these are its own beams.
+    own = looked_through(changes, [(scans, poses)], "before", chunk=2)
+    for mine, others in zip(own, asked, strict=True):
+        assert (mine.passed_own, mine.met_own) == beams(others)
+        assert (mine.passed, mine.met, others.passed_own, others.met_own) == (None,) * 4
+    # And the other way round: the boxes are what has appeared.
+    back = compare_maps(after, before).changes
+    for drive, name in (("before", "met"), ("after", "met_own")):
+        counted = looked_through(back, [(scans, poses)], drive, chunk=2)
+        (near_side,) = (change for change in counted if change.slot_b == 7 and change.kind == "line")
+        assert getattr(near_side, name) == at_side.sum()
