@@ -37,6 +37,7 @@ def random_map(dtype: str, lines: int = 5, circles: int = 4, free: int = 2) -> L
             extent=number(np.sort(rng.uniform(-4, 4, (k, 2)))),
             var_extent=number(rng.uniform(0, 1e-3, (k, 2))),
             times_detected=jnp.asarray(rng.integers(1, 40, k), jnp.int32),
+            times_contradicted=jnp.asarray(rng.integers(0, 9, k), jnp.int32),
             valid=jnp.asarray(slot_l),
         ),
         circles=Circles(
@@ -46,6 +47,7 @@ def random_map(dtype: str, lines: int = 5, circles: int = 4, free: int = 2) -> L
             sqrt_persistent=number(rng.normal(size=(c, 3, 3)) * [[0.02], [0.02], [0.0]] * fitted[:, None, None]),
             fitted=jnp.asarray(fitted),
             times_detected=jnp.asarray(rng.integers(1, 40, c), jnp.int32),
+            times_contradicted=jnp.asarray(rng.integers(0, 9, c), jnp.int32),
             valid=jnp.asarray(slot_c),
         ),
     )
@@ -77,6 +79,7 @@ def lines_between(
         extent=padded(np.stack([-half, half], -1)),
         var_extent=jnp.full((room, 2), 1e-4, dtype),
         times_detected=padded(np.full(count, times, np.int32), 0),
+        times_contradicted=jnp.zeros(room, jnp.int32),
         valid=padded(np.ones(count, bool), False),
     )
 
@@ -96,5 +99,6 @@ def poles_at(
         sqrt_persistent=jnp.zeros((room, 3, 3), dtype),
         fitted=jnp.asarray(valid & fitted),
         times_detected=jnp.asarray(np.where(valid, times, 0), jnp.int32),
+        times_contradicted=jnp.zeros(room, jnp.int32),
         valid=jnp.asarray(valid),
     )

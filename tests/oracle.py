@@ -57,6 +57,7 @@ class Lines:
     extent: np.ndarray  # [K, 2]
     var_extent: np.ndarray  # [K, 2]
     times_detected: np.ndarray  # [K]
+    times_contradicted: np.ndarray  # [K]
     valid: np.ndarray  # [K]
 
     @property
@@ -73,6 +74,11 @@ class Lines:
     def tangent(self) -> np.ndarray:
         """Unit tangents, from begin to end. Shape `[K, 2]`."""
         return np.stack([-np.sin(self.angle), np.cos(self.angle)], -1)
+
+    @property
+    def length(self) -> np.ndarray:
+        """Lengths, m. Shape `[K]`."""
+        return self.extent[:, 1] - self.extent[:, 0]
 
     @property
     def begin(self) -> np.ndarray:
@@ -104,6 +110,7 @@ class Circles:
     sqrt_persistent: np.ndarray  # [K, 3, 3]
     fitted: np.ndarray  # [K]
     times_detected: np.ndarray  # [K]
+    times_contradicted: np.ndarray  # [K]
     valid: np.ndarray  # [K]
 
     @property
@@ -1085,6 +1092,7 @@ def extract(
         extent=_stack(found, "extent", (2,)),
         var_extent=_stack(found, "var_extent", (2,)),
         times_detected=np.ones(len(found), int),
+        times_contradicted=np.zeros(len(found), int),
         valid=np.ones(len(found), bool),
     )
 
@@ -1111,6 +1119,7 @@ def extract(
         sqrt_persistent=_stack(kept, "sqrt_persistent", (3, 3)),
         fitted=_stack(kept, "fitted", ()).astype(bool),
         times_detected=np.ones(len(kept), int),
+        times_contradicted=np.zeros(len(kept), int),
         valid=np.ones(len(kept), bool),
     )
     return Extraction(
@@ -1149,6 +1158,7 @@ def empty_map(capacity: Any) -> OracleMap:
             extent=np.zeros((k, 2)),
             var_extent=np.ones((k, 2)),
             times_detected=np.zeros(k, int),
+            times_contradicted=np.zeros(k, int),
             valid=np.zeros(k, bool),
         ),
         circles=Circles(
@@ -1158,6 +1168,7 @@ def empty_map(capacity: Any) -> OracleMap:
             sqrt_persistent=np.zeros((c, 3, 3)),
             fitted=np.zeros(c, bool),
             times_detected=np.zeros(c, int),
+            times_contradicted=np.zeros(c, int),
             valid=np.zeros(c, bool),
         ),
     )
@@ -1600,6 +1611,33 @@ def _merge(
 
 
 # ---------------------------------------------------------------------------------------------------------------------
+# Giving way
+
+
+def _in_its_place(new: Lines, old: Lines) -> bool:
+    """Whether one line lies along more than half of another one."""
+    s = np.sort([dot(end - old.anchor, old.tangent)[0] for end in (new.begin, new.end)])
+    (begin, end), length = old.extent[0], new.length[0]
+    return 2 * min(length, s[1] - begin, end - s[0]) > end - begin
+
+
+def _give_way(slots: Any, against: set[int], borne_out: set[int], believed: bool, thresholds: Any) -> int:
+    """Free what was contradicted too often, as Page's cumulated sum has it; how many went."""
+    gone = 0
+    for slot in np.flatnonzero(slots.valid).tolist():
+        times = int(slots.times_contradicted[slot])
+        if slot in borne_out:
+            times = max(times - 1, 0)
+        elif slot in against and believed:
+            times += 1
+        slots.times_contradicted[slot] = times
+        if times and (times > slots.times_detected[slot] or times >= float(thresholds.contradictions)):
+            _free(slots, slot)
+            gone += 1
+    return gone
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 # Wiping
 
 
@@ -1763,6 +1801,7 @@ def _piece(line: Lines, a: float, b: float, var_ends: np.ndarray, weight: float)
         "extent": np.array([a, b]) + tangent @ shift,
         "var_extent": var_ends,
         "times_detected": line.times_detected[0],
+        "times_contradicted": line.times_contradicted[0],
         "valid": True,
     }
 
@@ -1886,6 +1925,7 @@ def _update_circles(
     targets: np.ndarray,
     measured: np.ndarray,
     triangles: list[np.ndarray],
+    evidence: tuple[float, float],
     report: Report,
     *,
     thresholds: Any,
@@ -1893,20 +1933,27 @@ def _update_circles(
     pose_error: PoseError,
     share: float,
 ) -> None:
-    """The circles of the scan into the map, after its lines."""
+    """The circles of the scan into the map, after its lines; `evidence` in metres of these, for the map and against."""
     lines, circles, new = new_map.lines, new_map.circles, forget(found.circles, share)
     reach = float(thresholds.circle_line_distance)
 
     members: dict[int, list[tuple[float, int]]] = {}
     added = []
+    against, (agree, contradict) = set(), evidence
     for i in range(len(new.radius)):
         match, distance = match_circle(circles, new, i, thresholds=thresholds, rules=rules, pose_error=pose_error)
         report.circle_nis[i], report.circle_dof[i] = match.nis, match.dof
         if match.slot >= 0:
             report.circle_slot[i] = match.slot
             members.setdefault(match.slot, []).append((distance, i))
+            agree += 2 * new.radius[i]
         elif match.suspect < 0 or not rules.leave_out_ambiguous:
             added.append(i)
+        else:
+            contradict += 2 * new.radius[i]
+            step = new.center[i] - circles.center[match.suspect]
+            if math.hypot(*step) < new.radius[i] + circles.radius[match.suspect]:
+                against.add(match.suspect)
 
     # What is about to be fused was seen, and is spared.
     for slot in np.flatnonzero(circles.valid).tolist():
@@ -1923,6 +1970,8 @@ def _update_circles(
     for slot, assigned in members.items():
         _fuse_circle(circles, slot, new, [i for _, i in sorted(assigned)], rules=rules, pose_error=pose_error)
         report.fused += 1
+    if rules.give_way:
+        report.deleted += _give_way(circles, against, set(members), agree > contradict, thresholds)
 
     on_map = lines.take(np.flatnonzero(lines.valid))
     for i in added:
@@ -2021,7 +2070,7 @@ def update(
         if len(sweep.r):
             drifted = float(persistence.correlation) ** 2
             new_map = OracleMap(lines=forget(new_map.lines, drifted), circles=forget(new_map.circles, drifted))
-    lines = new_map.lines
+    lines, before = new_map.lines, _copy(new_map.lines)
     if not rules.share_pose:
         found = dataclasses.replace(found, lines=forget(found.lines, 0.0))
     pairs = pairs_of(found.lines, thresholds=thresholds)
@@ -2041,11 +2090,20 @@ def update(
         ties=ties,
     )
 
+    agree, contradict = (float(found.lines.length[of].sum()) for of in (report.line_slot >= 0, suspects >= 0))
+    against = [
+        int(slot) if slot >= 0 and _in_its_place(found.lines.take(i), before.take(slot)) else -1
+        for i, slot in enumerate(suspects)
+    ]
+
     if rules.merge:
         freed = _merge(lines, targets, pairs, thresholds=thresholds, rules=rules, pose_error=pose_error, ties=ties)
         report.merged += len(freed)
         for slots in (targets, suspects, report.line_slot):
             slots[:] = [freed.get(slot, slot) for slot in slots.tolist()]
+        against = [freed.get(slot, slot) for slot in against]
+    if rules.give_way:
+        report.deleted += _give_way(lines, set(against), set(targets.tolist()), agree > contradict, thresholds)
 
     own = np.where(targets >= 0, targets, suspects)
     label = found.line_of_beam[sweep.beam]
@@ -2071,6 +2129,7 @@ def update(
         targets,
         measured,
         triangles,
+        (agree, contradict),
         report,
         thresholds=thresholds,
         rules=rules,

@@ -137,7 +137,7 @@ def test_other_settings_are_told() -> None:
     assert differences(*mounts) == "mount.x 0.0 (now 0.18)"
     assert differences({"slam": {}} | mounts[0], mounts[1]) == ""
     assert differences(before | {"rules": PAPER_RULES}, now).endswith(
-        "rules.maximum_likelihood False (now True) and 13 more"
+        "rules.maximum_likelihood False (now True) and 14 more"
     )
 
 

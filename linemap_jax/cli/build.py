@@ -66,7 +66,7 @@ class Build(LogOptions):
 
         map_file, picture, page = (self.output / f"map.{ending}" for ending in ("json", "png", "html"))
         check_output(self.output, map_file, picture, *([page] if self.html else []), overwrite=self.overwrite)
-        before = map_to_resume(self.resume_from, self.dtype) if self.resume_from else None
+        before = map_to_resume(self.resume_from, self.dtype, self.pose_error) if self.resume_from else None
         if before is not None and not states_noise(self):
             options["noise"] = noise_of_map(before.settings) or options["noise"]
         log = opened(self, self.log)

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 if TYPE_CHECKING:
+    from linemap_jax.core.settings import PoseError
     from linemap_jax.core.state import LineMap
 
 START_CAPACITY = (1024, 512)
@@ -24,18 +25,24 @@ class Before(NamedTuple):
     settings: dict[str, Any]
 
 
-def map_to_resume(path: Path, dtype: Literal["float32", "float64"]) -> Before:
+def map_to_resume(path: Path, dtype: Literal["float32", "float64"], pose_error: "PoseError") -> Before:
     """The map of a file, in the precision of now.
+
+    What persists is the same error in map and log only if both are of one drive by "persistent". Any other map is taken
+    by that model as one that shares no error with the log.
 
     Raises:
       MapFileError: as `read_map`.
     """
+    from linemap_jax.core.fusion import forget
     from linemap_jax.core.slots import resize
     from linemap_jax.core.state import LineMap
     from linemap_jax.io.map_file import read_map
 
     line_map, settings = read_map(path, dtype=dtype)
     lines, circles = line_map.lines, line_map.circles
+    if pose_error == "persistent" != settings.get("pose_error"):
+        lines, circles = forget(lines, 0.0), forget(circles, 0.0)
     line_map = LineMap(
         lines=resize(lines, max(START_CAPACITY[0], lines.valid.shape[0])),
         circles=resize(circles, max(START_CAPACITY[1], circles.valid.shape[0])),

@@ -198,6 +198,7 @@ def measure_circles(
         sqrt_persistent=product(jac_circle_pose, square_root(pose.cov)[None]),
         fitted=fitted,
         times_detected=jnp.ones_like(clusters.last),
+        times_contradicted=jnp.zeros_like(clusters.last),
         valid=clusters.valid,
     )
     return neutral_where_free(dataclasses.replace(circles, valid=circles.valid & bounded(circles)))

@@ -296,6 +296,7 @@ def measure_lines(
         extent=extent,
         var_extent=_var_extent(points, pose, ends, angle, noise),
         times_detected=jnp.ones_like(runs.first),
+        times_contradicted=jnp.zeros_like(runs.first),
         valid=runs.valid & (extent[:, 1] - extent[:, 0] >= min_length),
     )
     lines = dataclasses.replace(lines, valid=lines.valid & bounded(lines))

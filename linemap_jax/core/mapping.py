@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Int
 from linemap_jax.core import fusion, matching, wiping
 from linemap_jax.core.circles import near_lines
 from linemap_jax.core.extract import as_dtype, observe, with_defaults
+from linemap_jax.core.frames import dot
 from linemap_jax.core.sensor import Points
 from linemap_jax.core.settings import (
     SCAN_CAPACITY,
@@ -43,6 +44,7 @@ from linemap_jax.core.state import (
     Pose,
     Report,
     Scan,
+    SlotsT,
     Status,
     empty_circles,
     empty_lines,
@@ -176,7 +178,7 @@ def integrate(
         line_map.circles,
         found,
         swept.lines,
-        lines.targets,
+        lines,
         swept.gone,
         thresholds,
         rules,
@@ -198,7 +200,7 @@ def integrate(
         merged=lines.merged,
         trimmed=swept.wiped.trimmed,
         split=swept.wiped.split,
-        deleted=swept.wiped.deleted + circles.deleted,
+        deleted=lines.gave_way + swept.wiped.deleted + circles.deleted,
         status=status,
     )
     return LineMap(lines=swept.lines, circles=circles.model), report
@@ -216,6 +218,9 @@ class _LineUpdate(NamedTuple):
     added: Array
     fused: Array
     merged: Array
+    gave_way: Array
+    for_the_map: Array  # m of the scan's lines that bear out lines of the map
+    against_it: Array  # m that contradict
     overflow: Array
 
 
@@ -249,11 +254,12 @@ def _update_lines(
     fused = fusion.fuse_lines(mine, has_prior, new, together, thresholds, rules, pose_error, share)
     # All pieces of a line have the same result; the first one writes it.
     first = first_of_group(together)
-    model = put(model, jnp.where(first, targets, -1), fused)
+    before, model = model, put(model, jnp.where(first, targets, -1), fused)
 
     slot = jnp.where(leader >= 0, NEW, match.slot)
     slot = jnp.where(targets < 0, LEFT_OUT, slot)
     suspect = match.suspect
+    in_its_place = _in_its_place(new, take(before, suspect), thresholds, pose_error)
     merged = jnp.zeros((), jnp.int32)
     if rules.merge:
         seen_apart = _mark(~pair.collinear, targets, model.valid.shape[0])
@@ -261,6 +267,11 @@ def _update_lines(
         model, moved, merged = merge_lines(model, fused, touched, seen_apart, thresholds, rules, pose_error)
         targets = jnp.where(targets >= 0, moved[targets], targets)
         slot, suspect = (jnp.where(x >= 0, moved[x], x) for x in (slot, suspect))
+    for_the_map, against_it = (jnp.sum(jnp.where(x, new.length, 0)) for x in (has_prior, match.suspect >= 0))
+    gave_way = jnp.zeros((), jnp.int32)
+    if rules.give_way:
+        contradicting = jnp.where(in_its_place, suspect, -1)
+        model, gave_way = _give_way(model, contradicting, targets, for_the_map > against_it, thresholds)
     return _LineUpdate(
         model=model,
         targets=targets,
@@ -271,8 +282,52 @@ def _update_lines(
         added=jnp.sum(slot_of_leader >= 0, dtype=jnp.int32),
         fused=jnp.sum(first & has_prior, dtype=jnp.int32),
         merged=merged,
+        gave_way=gave_way,
+        for_the_map=for_the_map,
+        against_it=against_it,
         overflow=overflow,
     )
+
+
+def _in_its_place(new: Lines, old: Lines, thresholds: Thresholds, pose_error: PoseError) -> Bool[Array, " L"]:
+    """Whether each line of the scan lies along half of an old one, at least: it cannot be its neighbour then."""
+
+    def overlap(new: Lines, old: Lines) -> Array:
+        gap = matching.compare_lines(new, old, thresholds, pose_error).gap
+        return jnp.minimum(-gap, new.length)
+
+    return 2 * jax.vmap(overlap)(new, old) > old.length
+
+
+def _give_way(
+    model: SlotsT,
+    contradicting: Int[Array, " L"],
+    bearing_out: Int[Array, " L"],
+    agrees: Bool[Array, ""],
+    thresholds: Thresholds,
+) -> tuple[SlotsT, Int[Array, ""]]:
+    """Let go of what scans contradict: Page's test, of scans against those that bear it out.
+
+    Args:
+      model: lines or circles of the map.
+      contradicting: for each primitive of the scan the slot of the one that it contradicts, -1 for none.
+      bearing_out: the same, of the one that it was fused into.
+      agrees: whether the scan agrees with most of the map that it has seen. If it does not, its pose is to blame.
+      thresholds: `contradictions`.
+
+    Returns:
+      The lines or circles, and how many are gone.
+    """
+    k = model.valid.shape[0]
+    against, borne_out = (
+        jnp.zeros(k, bool).at[jnp.where(slots < 0, k, slots)].set(True, mode="drop")
+        for slots in (contradicting, bearing_out)
+    )
+    less = jnp.where(borne_out, -1, jnp.where(against & agrees, 1, 0))
+    times = jnp.maximum(model.times_contradicted + less, 0)
+    gone = model.valid & (times > 0) & (times >= jnp.minimum(model.times_detected + 1, thresholds.contradictions))
+    model = dataclasses.replace(model, times_contradicted=times, valid=model.valid & ~gone)
+    return model, jnp.sum(gone, dtype=jnp.int32)
 
 
 def _mark(which: Bool[Array, "L L"], slots: Int[Array, " L"], capacity: int) -> Bool[Array, "L K"]:
@@ -408,7 +463,7 @@ def _update_circles(
     model: Circles,
     found: Extraction,
     lines: Lines,
-    targets: Int[Array, " L"],
+    seen: _LineUpdate,
     gone: Bool[Array, " K"],
     thresholds: Thresholds,
     rules: Rules,
@@ -418,13 +473,22 @@ def _update_circles(
     """Section 5.2: match, then fuse or add; and none too close to a line."""
     new = fusion.forget(found.circles, share)
     match = matching.match_circles(new, model, thresholds, rules, pose_error)
+    suspect = take(model, match.suspect)
+    step = new.center - suspect.center
+    overlap = dot(step, step) < jnp.square(new.radius + suspect.radius)
     k = model.valid.shape[0]
     matched = jnp.zeros(k, bool).at[jnp.where(match.slot < 0, k, match.slot)].set(True, mode="drop")
     gone = gone & ~matched
     model = fusion.fuse_circles(model, new, match, rules, pose_error)
     model = dataclasses.replace(model, valid=model.valid & ~gone)
+    gave_way = jnp.zeros((), jnp.int32)
+    if rules.give_way:
+        bearing_out, against = (jnp.sum(jnp.where(x >= 0, new.radius, 0)) for x in (match.slot, match.suspect))
+        agrees = seen.for_the_map + 2 * bearing_out > seen.against_it + 2 * against
+        contradicting = jnp.where(overlap, match.suspect, -1)
+        model, gave_way = _give_way(model, contradicting, match.slot, agrees, thresholds)
 
-    fresh = new.valid & (match.slot < 0) & ~match.ambiguous & ~near_lines(new, lines, thresholds, rules)
+    fresh = new.valid & (match.slot < 0) & (match.suspect < 0) & ~near_lines(new, lines, thresholds, rules)
     slot, overflow = free_slots(fresh, model.valid)
     # A circle that is not fitted is the visible arc and moves with the viewpoint: its covariance is this scan's alone.
     names = ("cov_independent", "sqrt_persistent")
@@ -432,8 +496,8 @@ def _update_circles(
     model = put(model, slot, dataclasses.replace(new, **lasting))
 
     # Only lines that this scan touched can have come near a circle.
-    touched = take(lines, targets)
-    touched = dataclasses.replace(touched, valid=touched.valid & (targets >= 0))
+    touched = take(lines, seen.targets)
+    touched = dataclasses.replace(touched, valid=touched.valid & (seen.targets >= 0))
     near = near_lines(model, touched, thresholds, rules)
     model = dataclasses.replace(model, valid=model.valid & ~near)
     report = jnp.where(match.slot >= 0, match.slot, jnp.where(slot >= 0, NEW, LEFT_OUT))
@@ -444,6 +508,6 @@ def _update_circles(
         dof=match.dof,
         added=jnp.sum(slot >= 0, dtype=jnp.int32),
         fused=jnp.sum(matched, dtype=jnp.int32),
-        deleted=jnp.sum(gone, dtype=jnp.int32) + jnp.sum(near, dtype=jnp.int32),
+        deleted=jnp.sum(gone, dtype=jnp.int32) + jnp.sum(near, dtype=jnp.int32) + gave_way,
         overflow=overflow,
     )

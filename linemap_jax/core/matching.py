@@ -284,8 +284,8 @@ class CircleMatches:
     """Normalised distance of the nearest within the distance gate, before the statistical one; 0 for none."""
     dof: Int[Array, " C"]
     """Degrees of freedom of that: 3, or 0 where nothing was compared."""
-    ambiguous: Bool[Array, " C"]
-    """Whether it is near a circle, but not it."""
+    suspect: Int[Array, " C"]
+    """The circle of the map that it is near, but is not; -1 for none."""
 
 
 def match_circles(
@@ -328,5 +328,5 @@ def match_circles(
         distance=jnp.where(matched, distance, 0),
         nis=nis,
         dof=jnp.where(both, 3, 0).astype(jnp.int32),
-        ambiguous=near & ~matched & rules.leave_out_ambiguous,
+        suspect=jnp.where(near & ~matched & rules.leave_out_ambiguous, slot, -1),
     )

@@ -77,7 +77,7 @@ def merge_maps(
     match = matching.match_circles(new, line_map.circles, gates, rules, pose_error)
     circles = fusion.fuse_circles(line_map.circles, new, match, rules, pose_error)
     kept = circles.valid & ~near_lines(circles, _only(lines, involved), gates, rules)
-    fresh = new.valid & (match.slot < 0) & ~match.ambiguous & ~near_lines(new, lines, gates, rules)
+    fresh = new.valid & (match.slot < 0) & (match.suspect < 0) & ~near_lines(new, lines, gates, rules)
     both = _concatenate(_only(circles, kept), _only(new, fresh))
     fused = jnp.sum(new.valid & (match.slot >= 0), dtype=jnp.int32)
     before = jnp.sum(line_map.circles.valid, dtype=jnp.int32) + jnp.sum(new.valid, dtype=jnp.int32)

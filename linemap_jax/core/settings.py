@@ -69,6 +69,10 @@ class Thresholds:
     circle_match_nis: Number = 11.34
     """Largest normalised distance of matching fitted circles: 99 % of chi-square with 3 degrees of freedom. Not in the
     paper, whose circles have no covariance."""
+    contradictions: Number = 10
+    """A line or circle of the map leaves it when so many more scans have contradicted it than have since borne it out,
+    or more than have ever seen it; needs `Rules.give_way`. As Page's test (1954): a scan in a hundred contradicts what
+    stands still, and never ten in excess."""
     end_sigmas: Number = 3.0
     """End points that agree within this multiple of their spread are averaged; needs `Rules.estimate_ends`."""
     wipe_extension: Number = 0.05
@@ -191,6 +195,9 @@ class Rules:
     leave_out_ambiguous: bool = True
     """A new line that passes the geometric gates but fails the statistical one is neither fused nor added. To add
     it, as the paper does, holds the same wall twice: the gate turns true matches away too."""
+    give_way: bool = True
+    """What scans contradict again and again leaves the map. Neither fused nor added, what has moved by centimetres
+    would stay where it was: no beam passes through its place."""
     merge: bool = True
     """Lines of the map that overlap and agree become one. Pieces into which a line was cut share its information, so
     that a door that opens and closes does not make its wall better known."""

@@ -167,7 +167,8 @@ def put(slots: SlotsT, index: Int[Array, " M"], rows: SlotsT) -> SlotsT:
 
 def _discrete(slots: SlotsT) -> list[str]:
     """The fields that are not floats."""
-    return [field.name for field in dataclasses.fields(slots) if field.name in ("times_detected", "fitted", "valid")]
+    discrete = ("times_detected", "times_contradicted", "fitted", "valid")
+    return [field.name for field in dataclasses.fields(slots) if field.name in discrete]
 
 
 def _packed(slots: SlotsT) -> tuple[Float[Array, "P K"], Callable[..., SlotsT]]:

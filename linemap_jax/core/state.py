@@ -192,6 +192,8 @@ class Lines:
     """Variances of the end points along the tangent, m^2."""
     times_detected: Int[Array, " K"]
     """How many scans have seen the line."""
+    times_contradicted: Int[Array, " K"]
+    """How many scans have seen another line in its place since one has seen it."""
     valid: Bool[Array, " K"]
     """Which slots are in use."""
 
@@ -266,6 +268,8 @@ class Circles:
     """Whether the circle is a fitted pole; else it describes the points that were visible."""
     times_detected: Int[Array, " K"]
     """How many scans have seen the circle."""
+    times_contradicted: Int[Array, " K"]
+    """How many scans have seen another circle in its place since one has seen it."""
     valid: Bool[Array, " K"]
     """Which slots are in use."""
 
@@ -397,6 +401,7 @@ def empty_lines(capacity: int, dtype: Any = None) -> Lines:
         extent=_filled((capacity, 2), 0, dtype),
         var_extent=_filled((capacity, 2), 1, dtype),
         times_detected=_filled((capacity,), 0, np.int32),
+        times_contradicted=_filled((capacity,), 0, np.int32),
         valid=_filled((capacity,), False, bool),
     )
 
@@ -411,6 +416,7 @@ def empty_circles(capacity: int, dtype: Any = None) -> Circles:
         sqrt_persistent=_filled((capacity, 3, 3), 0, dtype),
         fitted=_filled((capacity,), False, bool),
         times_detected=_filled((capacity,), 0, np.int32),
+        times_contradicted=_filled((capacity,), 0, np.int32),
         valid=_filled((capacity,), False, bool),
     )
 

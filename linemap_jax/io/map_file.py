@@ -46,6 +46,7 @@ _LINE_VIEW = {"rho": (), "theta": (), "cov": (2, 2), "begin": (2,), "end": (2,),
 _CIRCLE = {"center": (2,), "radius": ()}
 _FIT_STATE = {"cov_independent": (3, 3), "sqrt_persistent": (3, 3)}
 _FIT_VIEW = {"cov": (3, 3)}
+_COUNTS = ("times_detected", "times_contradicted")
 
 _ROUNDING = 1e-5
 """How far rounding to float32 may carry a correlation, or the view's, from what it should be; no unit."""
@@ -150,12 +151,13 @@ def columns_of_lines(lines: Lines) -> Columns:
     """
     view = dict(zip(_LINE_VIEW, _view(lines), strict=True))
     state = {name: getattr(lines, name) for name in _LINE_STATE}
-    return _used({**view, "times_detected": lines.times_detected, **state}, lines.valid)
+    counts = {name: getattr(lines, name) for name in _COUNTS}
+    return _used({**view, **counts, **state}, lines.valid)
 
 
 def columns_of_circles(circles: Circles) -> Columns:
     """What a map file says of each circle, field by field, and `fitted`: only of those that are does `cov` count."""
-    names = (*_CIRCLE, "times_detected", *_FIT_VIEW, *_FIT_STATE, "fitted")
+    names = (*_CIRCLE, *_COUNTS, *_FIT_VIEW, *_FIT_STATE, "fitted")
     return _used({name: getattr(circles, name) for name in names}, circles.valid)
 
 
@@ -336,12 +338,14 @@ def _column(entries: list[dict[str, Any]], kind: str, name: str, shape: tuple[in
 
 
 def _counts(entries: list[dict[str, Any]], kind: str) -> Columns:
-    for i, entry in enumerate(entries):
-        times = entry.get("times_detected")
-        if type(times) is not int or not 0 <= times <= np.iinfo(np.int32).max:
-            raise _Fault(f"{kind}[{i}].times_detected must be a whole number, 0 or more")
-    times = np.array([entry["times_detected"] for entry in entries], np.int32)
-    return {"times_detected": times, "valid": np.ones(len(entries), bool)}
+    counts = {"valid": np.ones(len(entries), bool)}
+    for name in _COUNTS:
+        for i, entry in enumerate(entries):
+            times = entry.get(name)
+            if type(times) is not int or not 0 <= times <= np.iinfo(np.int32).max:
+                raise _Fault(f"{kind}[{i}].{name} must be a whole number, 0 or more")
+        counts[name] = np.array([entry[name] for entry in entries], np.int32)
+    return counts
 
 
 def _check_cov(

@@ -28,7 +28,7 @@ from linemap_jax.core.estimation.registration import nearest, register
 from linemap_jax.core.estimation.surface import Surface, middle_of, seen_from, surface_of_scan
 from linemap_jax.core.estimation.tracking import TrackingSettings, _cov_guess, begin_track, track
 from linemap_jax.core.settings import SensorNoise, Thresholds
-from linemap_jax.core.state import LineMap, Lines, Pose, Scan, empty_lines
+from linemap_jax.core.state import LineMap, Lines, Pose, Scan, empty_lines, squared
 from linemap_jax.slam import slam
 
 adjusted, optimised = jax.jit(adjust), jax.jit(optimise)
@@ -412,13 +412,14 @@ def test_what_no_keyframe_has_seen_is_as_uncertain_as_the_nearest_one() -> None:
     def circle(error: np.ndarray) -> np.ndarray:
         return np.append(moved(error, np.asarray(circles.center)[0]), 0.1)
 
-    for function, before, cov in (
-        (line, lines.cov_independent, after.lines.cov_independent),
-        (circle, circles.cov_independent, after.circles.cov_independent),
+    for function, before, now in (
+        (line, lines, after.lines),
+        (circle, circles, after.circles),
     ):
         jac = np.stack([(function(h) - function(-h)) / 2e-6 for h in 1e-6 * np.eye(3)], -1)
-        np.testing.assert_allclose(cov[0] - before[0], jac @ cov_poses[0] @ jac.T, atol=1e-10)
-        np.testing.assert_array_equal(cov[1:], before[1:])
+        np.testing.assert_allclose(squared(now.sqrt_persistent)[0], jac @ cov_poses[0] @ jac.T, atol=1e-10)
+        np.testing.assert_array_equal(now.cov_independent, before.cov_independent)
+        np.testing.assert_array_equal(now.sqrt_persistent[1:], before.sqrt_persistent[1:])
 
 
 def test_where_the_first_pose_errs_all_turns_and_moves_with_it() -> None:
@@ -452,9 +453,9 @@ def test_where_the_first_pose_errs_all_turns_and_moves_with_it() -> None:
         jac = derivative(lambda error, pose=pose: moved(error, pose))
         np.testing.assert_allclose(after.cov_poses[k], 0.1 * np.eye(3) + jac @ cov @ jac.T, atol=1e-9)
     jac = derivative(line)
-    own = lines.cov_independent
-    np.testing.assert_allclose(after.lines.cov_independent[0], own[0] + jac @ cov @ jac.T, atol=1e-9)
-    np.testing.assert_array_equal(after.lines.cov_independent[1:], own[1:])
+    np.testing.assert_allclose(squared(after.lines.sqrt_persistent)[0], jac @ cov @ jac.T, atol=1e-9)
+    np.testing.assert_array_equal(after.lines.cov_independent, lines.cov_independent)
+    np.testing.assert_array_equal(after.lines.sqrt_persistent[1:], lines.sqrt_persistent[1:])
 
 
 def test_what_was_seen_in_a_sweep_errs_with_it() -> None:

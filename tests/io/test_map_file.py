@@ -164,10 +164,10 @@ def test_the_file_as_other_tools_see_it(tmp_path: Path) -> None:
     assert (line["sqrt_persistent"], line["first_angle"]) == ([[0.02, 0, 0], [0, 0, 0]], 0.25)
     pole, cluster = found["circles"]
     covariances = {"cov": 5 * np.eye(3), "cov_independent": np.eye(3), "sqrt_persistent": 2 * np.eye(3)}
-    assert pole == {"center": [1, 2], "radius": 0.25, "times_detected": 1} | {
+    assert pole == {"center": [1, 2], "radius": 0.25, "times_detected": 1, "times_contradicted": 0} | {
         name: matrix.tolist() for name, matrix in covariances.items()
     }
-    assert cluster == {"center": [3, 4], "radius": 0.5, "times_detected": 2}
+    assert cluster == {"center": [3, 4], "radius": 0.5, "times_detected": 2, "times_contradicted": 0}
     # one line of text for each primitive
     assert sum('"rho"' in row for row in text.splitlines()) == 1
     assert sum('"center"' in row for row in text.splitlines()) == 2
@@ -310,6 +310,7 @@ DAMAGES = [
     (_set("lines", 0, "extent", [1.0, 0.0]), "lines[0].extent runs backwards"),
     (_set("lines", 0, "var_extent", [1.0, -1.0]), "lines[0].var_extent is negative"),
     (_set("lines", 0, "times_detected", 1.5), "lines[0].times_detected must be a whole number"),
+    (_set("lines", 0, "times_contradicted", -1), "lines[0].times_contradicted must be a whole number"),
     (_set("lines", 0, "times_detected", -1), "lines[0].times_detected must be a whole number"),
     (_drop("circles", 0, "times_detected"), "circles[0].times_detected must be a whole number"),
 ]

@@ -38,6 +38,7 @@ def some_map(lines: int = 6, circles: int = 4, size: float = 10.0) -> LineMap:
             extent=number(np.sort(rng.uniform(-2, 2, (lines, 2)))),
             var_extent=number(np.full((lines, 2), 1e-4)),
             times_detected=jnp.asarray(rng.integers(1, 40, lines), jnp.int32),
+            times_contradicted=jnp.zeros(lines, jnp.int32),
             valid=jnp.ones(lines, bool),
         ),
         circles=Circles(
@@ -47,6 +48,7 @@ def some_map(lines: int = 6, circles: int = 4, size: float = 10.0) -> LineMap:
             sqrt_persistent=number(np.diag([0.02, 0.01, 0.0]) * fitted[:, None, None]),
             fitted=jnp.asarray(fitted),
             times_detected=jnp.asarray(rng.integers(1, 40, circles), jnp.int32),
+            times_contradicted=jnp.zeros(circles, jnp.int32),
             valid=jnp.ones(circles, bool),
         ),
     )

@@ -4,6 +4,9 @@ Lines that were seen from one pose share its error, and a line that was seen fro
 are kept when poses and lines are unknowns of one system: the steps of the pose graph, and one sighting of a line from a
 keyframe with the covariance of its measurement alone. The inverse of the system holds the covariances of all poses and
 lines, with what correlates them.
+
+What a line errs by with the poses is its `sqrt_persistent`: it does not average away, and a later drive that is
+localised in the map takes it over. The rest is the noise of its own sightings.
 """
 
 import dataclasses
@@ -21,7 +24,7 @@ from linemap_jax.core.frames import between, dot, perp, rotate, unit, wrap_angle
 from linemap_jax.core.matching import best_line, match_circles, with_sign
 from linemap_jax.core.propagation import apply, inverse, propagate, quadratic, square_root, symmetric
 from linemap_jax.core.settings import SCAN_CAPACITY, Capacity, Method, Number, Rules, SensorNoise, Thresholds
-from linemap_jax.core.state import Circles, LineMap, Lines, Pose, Scan, pytree
+from linemap_jax.core.state import Circles, LineMap, Lines, Pose, Scan, SlotsT, pytree, squared
 
 WIDENING = (100.0, 10.0, 1.0, 1.0, 1.0)
 """Of the gate, in each iteration of Gauss and Newton: the graph is some centimetres off where sightings are good to
@@ -318,16 +321,25 @@ def adjust(graph: PoseGraph, lines: Lines, sightings: LineSightings) -> Adjusted
     cov = scale * cov
     cov_poses = jnp.moveaxis(jnp.diagonal(cov.reshape(n, 3, n, 3), axis1=0, axis2=2), -1, 0)
     spread = (cov @ through.reshape(3 * n, 2 * k)).reshape(3 * n, k, 2)
-    cov_lines = scale * inverse(now.of_lines) + jnp.einsum("pki,pkj->kij", through, spread)
+    with_poses = jnp.einsum("pki,pkj->kij", through, spread)
     seen = now.seen
     moved = dataclasses.replace(
         lines,
         offset=state[:, 0],
         angle=wrap_angle(state[:, 1]),
-        cov_independent=jnp.where(seen[:, None, None], symmetric(cov_lines), lines.cov_independent),
+        cov_independent=jnp.where(seen[:, None, None], scale * inverse(now.of_lines), lines.cov_independent),
         sqrt_persistent=jnp.where(seen[:, None, None], 0, lines.sqrt_persistent),
     )
+    moved = _with_persistent(moved, jnp.where(seen[:, None, None], symmetric(with_poses), 0))
     return Adjusted(poses, symmetric(cov_poses), moved, seen, unit_variance)
+
+
+def _with_persistent(slots: SlotsT, cov: Float[Array, "K n n"]) -> SlotsT:
+    """Lines or circles that err by more than they did, by what does not average away."""
+    root = square_root(squared(slots.sqrt_persistent) + cov)
+    wide = jnp.zeros_like(slots.sqrt_persistent).at[..., : root.shape[-1]].set(root)
+    some = jnp.any(cov != 0, (-2, -1))
+    return dataclasses.replace(slots, sqrt_persistent=jnp.where(some[:, None, None], wide, slots.sqrt_persistent))
 
 
 def with_error_of_first(adjusted: Adjusted, cov: Float[Array, "3 3"]) -> Adjusted:
@@ -350,7 +362,7 @@ def with_error_of_first(adjusted: Adjusted, cov: Float[Array, "3 3"]) -> Adjuste
     of_lines = jnp.where(adjusted.seen[:, None, None], of_lines, 0)
     return adjusted._replace(
         cov_poses=adjusted.cov_poses + jax.vmap(of_pose)(adjusted.poses),
-        lines=dataclasses.replace(lines, cov_independent=lines.cov_independent + of_lines),
+        lines=_with_persistent(lines, of_lines),
     )
 
 
@@ -396,10 +408,7 @@ def with_error_of_poses(
     more = jnp.where((seen | ~lines.valid)[:, None, None], 0, more)
     around = jax.vmap(of_circle)(circles.center).astype(dtype)
     around = jnp.where((circles.valid & circles.fitted)[:, None, None], around, 0)
-    return LineMap(
-        lines=dataclasses.replace(lines, cov_independent=lines.cov_independent + more),
-        circles=dataclasses.replace(circles, cov_independent=circles.cov_independent + around),
-    )
+    return LineMap(lines=_with_persistent(lines, more), circles=_with_persistent(circles, around))
 
 
 class _System(NamedTuple):

@@ -570,7 +570,8 @@ def _fused_circle(x: Float[Array, "6"]) -> Float[Array, "3"]:
     )
     slot = jnp.zeros(1, jnp.int32)
     zero = jnp.zeros(1)
-    match = CircleMatches(slot=slot, distance=zero, nis=zero, dof=slot, ambiguous=jnp.zeros(1, bool))
+    none = jnp.full(1, -1, jnp.int32)
+    match = CircleMatches(slot=slot, distance=zero, nis=zero, dof=slot, suspect=none)
     found = fusion.fuse_circles(old, new, match, PAPER_RULES, "independent")
     return jnp.concatenate([found.center[0], found.radius])
 

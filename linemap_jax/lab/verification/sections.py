@@ -182,6 +182,7 @@ def _poles(center: np.ndarray) -> Circles:
         sqrt_persistent=jnp.zeros((count, 3, 3)),
         fitted=jnp.ones(count, bool),
         times_detected=jnp.ones(count, jnp.int32),
+        times_contradicted=jnp.zeros(count, jnp.int32),
         valid=jnp.ones(count, bool),
     )
 
