@@ -1286,6 +1286,8 @@ class Gates(NamedTuple):
     lever: np.ndarray  # [K], of the new line's anchor
     nis: np.ndarray  # [K], Eq. (21)
     gap: np.ndarray  # [K], m, along the map's line; negative where the two overlap
+    covered: np.ndarray  # [K], m, of the map's line
+    same_line: np.ndarray  # [K], by the end points
     collinear: np.ndarray  # [K], the same line, were it boundless
     geometric: np.ndarray  # [K]
     statistical: np.ndarray  # [K], Eq. (22)
@@ -1321,6 +1323,7 @@ def gates(new: Lines, old: Lines, *, thresholds: Any, pose_error: PoseError) -> 
 
     along = dot(ends - old.anchor[:, None], old.tangent[:, None])
     gap = np.maximum(along.min(-1) - old.extent[:, 1], old.extent[:, 0] - along.max(-1))
+    covered = np.minimum(along.max(-1), old.extent[:, 1]) - np.maximum(along.min(-1), old.extent[:, 0])
     collinear = same_direction & same_line & new.valid & old.valid
     return Gates(
         sign=sign,
@@ -1328,6 +1331,8 @@ def gates(new: Lines, old: Lines, *, thresholds: Any, pose_error: PoseError) -> 
         lever=lever,
         nis=nis,
         gap=gap,
+        covered=covered,
+        same_line=same_line & new.valid & old.valid,
         collinear=collinear,
         geometric=collinear & (gap < t.match_gap),
         statistical=nis < t.match_nis,
@@ -1614,11 +1619,14 @@ def _merge(
 # Giving way
 
 
-def _in_its_place(new: Lines, old: Lines) -> bool:
-    """Whether one line lies along more than half of another one."""
-    s = np.sort([dot(end - old.anchor, old.tangent)[0] for end in (new.begin, new.end)])
-    (begin, end), length = old.extent[0], new.length[0]
-    return 2 * min(length, s[1] - begin, end - s[0]) > end - begin
+def _contradicted(found: Lines, before: Lines, *, thresholds: Any, rules: Any, pose_error: PoseError) -> set[int]:
+    """Slots of lines of which a line of the scan covers half, from the same side, and fails Eq. (22)."""
+    slots, denied = np.flatnonzero(before.valid), set()
+    for i in range(len(found.offset)):
+        g = gates(found.take(i), before.take(slots), thresholds=thresholds, pose_error=pose_error)
+        faces = (g.sign > 0) | (not rules.tell_sides)
+        denied |= set(slots[g.same_line & faces & ~g.statistical & (2 * g.covered > before.length[slots])].tolist())
+    return denied
 
 
 def _give_way(slots: Any, against: set[int], borne_out: set[int], believed: bool, thresholds: Any) -> int:
@@ -2091,19 +2099,17 @@ def update(
     )
 
     agree, contradict = (float(found.lines.length[of].sum()) for of in (report.line_slot >= 0, suspects >= 0))
-    against = [
-        int(slot) if slot >= 0 and _in_its_place(found.lines.take(i), before.take(slot)) else -1
-        for i, slot in enumerate(suspects)
-    ]
+    against = _contradicted(
+        forget(found.lines, share), before, thresholds=thresholds, rules=rules, pose_error=pose_error
+    )
 
     if rules.merge:
         freed = _merge(lines, targets, pairs, thresholds=thresholds, rules=rules, pose_error=pose_error, ties=ties)
         report.merged += len(freed)
         for slots in (targets, suspects, report.line_slot):
             slots[:] = [freed.get(slot, slot) for slot in slots.tolist()]
-        against = [freed.get(slot, slot) for slot in against]
     if rules.give_way:
-        report.deleted += _give_way(lines, set(against), set(targets.tolist()), agree > contradict, thresholds)
+        report.deleted += _give_way(lines, against, set(targets.tolist()), agree > contradict, thresholds)
 
     own = np.where(targets >= 0, targets, suspects)
     label = found.line_of_beam[sweep.beam]

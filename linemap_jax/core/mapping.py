@@ -239,7 +239,8 @@ def _update_lines(
         new = fusion.forget(new, jnp.zeros_like(share))
 
     pair = matching.compare_pieces(new, thresholds)
-    match = matching.match_lines(fusion.forget(new, share), model, pair.collinear, thresholds, rules, pose_error)
+    apart = fusion.forget(new, share)
+    match = matching.match_lines(apart, model, pair.collinear, thresholds, rules, pose_error)
     unmatched = new.valid & (match.slot < 0) & (match.suspect < 0)
     leader = matching.group_lines(pair, unmatched, thresholds)
 
@@ -259,7 +260,6 @@ def _update_lines(
     slot = jnp.where(leader >= 0, NEW, match.slot)
     slot = jnp.where(targets < 0, LEFT_OUT, slot)
     suspect = match.suspect
-    in_its_place = _in_its_place(new, take(before, suspect), thresholds, pose_error)
     merged = jnp.zeros((), jnp.int32)
     if rules.merge:
         seen_apart = _mark(~pair.collinear, targets, model.valid.shape[0])
@@ -270,8 +270,8 @@ def _update_lines(
     for_the_map, against_it = (jnp.sum(jnp.where(x, new.length, 0)) for x in (has_prior, match.suspect >= 0))
     gave_way = jnp.zeros((), jnp.int32)
     if rules.give_way:
-        contradicting = jnp.where(in_its_place, suspect, -1)
-        model, gave_way = _give_way(model, contradicting, targets, for_the_map > against_it, thresholds)
+        denied = matching.contradicted(apart, before, thresholds, rules, pose_error)
+        model, gave_way = _give_way(model, denied & (for_the_map > against_it), targets, thresholds)
     return _LineUpdate(
         model=model,
         targets=targets,
@@ -289,45 +289,30 @@ def _update_lines(
     )
 
 
-def _in_its_place(new: Lines, old: Lines, thresholds: Thresholds, pose_error: PoseError) -> Bool[Array, " L"]:
-    """Whether each line of the scan lies along half of an old one, at least: it cannot be its neighbour then."""
-
-    def overlap(new: Lines, old: Lines) -> Array:
-        gap = matching.compare_lines(new, old, thresholds, pose_error).gap
-        return jnp.minimum(-gap, new.length)
-
-    return 2 * jax.vmap(overlap)(new, old) > old.length
-
-
 def _give_way(
-    model: SlotsT,
-    contradicting: Int[Array, " L"],
-    bearing_out: Int[Array, " L"],
-    agrees: Bool[Array, ""],
-    thresholds: Thresholds,
+    model: SlotsT, denied: Bool[Array, " K"], targets: Int[Array, " L"], thresholds: Thresholds
 ) -> tuple[SlotsT, Int[Array, ""]]:
-    """Let go of what scans contradict: Page's test, of scans against those that bear it out.
+    """Let go of what scans contradict: Page's test, of those that deny it against those that bear it out.
 
     Args:
       model: lines or circles of the map.
-      contradicting: for each primitive of the scan the slot of the one that it contradicts, -1 for none.
-      bearing_out: the same, of the one that it was fused into.
-      agrees: whether the scan agrees with most of the map that it has seen. If it does not, its pose is to blame.
+      denied: which of them the scan denies.
+      targets: for each primitive of the scan the slot of the one that it is part of, -1 for none.
       thresholds: `contradictions`.
 
     Returns:
       The lines or circles, and how many are gone.
     """
-    k = model.valid.shape[0]
-    against, borne_out = (
-        jnp.zeros(k, bool).at[jnp.where(slots < 0, k, slots)].set(True, mode="drop")
-        for slots in (contradicting, bearing_out)
-    )
-    less = jnp.where(borne_out, -1, jnp.where(against & agrees, 1, 0))
+    less = jnp.where(_marked(targets, denied.shape[0]), -1, denied.astype(jnp.int32))
     times = jnp.maximum(model.times_contradicted + less, 0)
     gone = model.valid & (times > 0) & (times >= jnp.minimum(model.times_detected + 1, thresholds.contradictions))
     model = dataclasses.replace(model, times_contradicted=times, valid=model.valid & ~gone)
     return model, jnp.sum(gone, dtype=jnp.int32)
+
+
+def _marked(slots: Int[Array, " L"], capacity: int) -> Bool[Array, " K"]:
+    """Which slots are named, -1 for none."""
+    return jnp.zeros(capacity, bool).at[jnp.where(slots < 0, capacity, slots)].set(True, mode="drop")
 
 
 def _mark(which: Bool[Array, "L L"], slots: Int[Array, " L"], capacity: int) -> Bool[Array, "L K"]:
@@ -477,7 +462,7 @@ def _update_circles(
     step = new.center - suspect.center
     overlap = dot(step, step) < jnp.square(new.radius + suspect.radius)
     k = model.valid.shape[0]
-    matched = jnp.zeros(k, bool).at[jnp.where(match.slot < 0, k, match.slot)].set(True, mode="drop")
+    matched = _marked(match.slot, k)
     gone = gone & ~matched
     model = fusion.fuse_circles(model, new, match, rules, pose_error)
     model = dataclasses.replace(model, valid=model.valid & ~gone)
@@ -485,8 +470,8 @@ def _update_circles(
     if rules.give_way:
         bearing_out, against = (jnp.sum(jnp.where(x >= 0, new.radius, 0)) for x in (match.slot, match.suspect))
         agrees = seen.for_the_map + 2 * bearing_out > seen.against_it + 2 * against
-        contradicting = jnp.where(overlap, match.suspect, -1)
-        model, gave_way = _give_way(model, contradicting, match.slot, agrees, thresholds)
+        denied = _marked(jnp.where(overlap, match.suspect, -1), k) & agrees
+        model, gave_way = _give_way(model, denied, match.slot, thresholds)
 
     fresh = new.valid & (match.slot < 0) & (match.suspect < 0) & ~near_lines(new, lines, thresholds, rules)
     slot, overflow = free_slots(fresh, model.valid)

@@ -40,6 +40,8 @@ class LineComparison:
     """Whether it passes the angle gate and the end-point gate."""
     geometric: Bool[Array, ""]
     """Whether it is collinear, and passes the gap gate."""
+    in_place: Bool[Array, ""]
+    """Whether it lies where the line of the map is: it passes the end-point gate, and covers half of that line."""
 
 
 @partial(jax.jit, static_argnames="pose_error")  # so that it is traced once, not once for each of its seven uses
@@ -87,8 +89,8 @@ def compare_lines(new: Lines, model: Lines, thresholds: Thresholds, pose_error: 
     nis = jnp.where(det > 0, jnp.maximum(weighted, 0) / jnp.where(det > 0, det, 1), 0)
 
     # Gates are compared as squares; that saves the square roots.
-    near = turn**2 < jnp.maximum(thresholds.match_angle**2, thresholds.match_sigmas**2 * var_angle)
-    along = []
+    parallel = turn**2 < jnp.maximum(thresholds.match_angle**2, thresholds.match_sigmas**2 * var_angle)
+    near, along = new.valid & model.valid, []
     middle = new.offset * new.normal - step
     for end in (new.extent[0], new.extent[1]):
         from_anchor = middle + end * new.tangent
@@ -98,7 +100,9 @@ def compare_lines(new: Lines, model: Lines, thresholds: Thresholds, pose_error: 
         variance = var_offset - 2 * from_new * covariance + from_new**2 * var_angle
         near = near & (across**2 < jnp.maximum(thresholds.match_distance**2, thresholds.match_sigmas**2 * variance))
         along.append(s)
-    gap = jnp.maximum(jnp.minimum(*along) - model.extent[1], model.extent[0] - jnp.maximum(*along))
+    low, high = jnp.minimum(*along), jnp.maximum(*along)
+    gap = jnp.maximum(low - model.extent[1], model.extent[0] - high)
+    covered = jnp.minimum(high, model.extent[1]) - jnp.maximum(low, model.extent[0])
     return LineComparison(
         offset=offset,
         angle=turn,
@@ -106,8 +110,9 @@ def compare_lines(new: Lines, model: Lines, thresholds: Thresholds, pose_error: 
         sign=sign,
         nis=nis,
         gap=gap,
-        collinear=new.valid & model.valid & near,
-        geometric=new.valid & model.valid & near & (gap < thresholds.match_gap),
+        collinear=parallel & near,
+        geometric=parallel & near & (gap < thresholds.match_gap),
+        in_place=near & (2 * covered > model.length),
     )
 
 
@@ -166,6 +171,30 @@ def with_sign(cov: Float[Array, "*s 2 2"], sign: Float[Array, "*s"]) -> Float[Ar
     """Covariance of (sign offset, angle), from `cov`, that of (offset, angle), and a `sign` of 1 or -1."""
     one = jnp.ones_like(sign)
     return cov * jnp.stack([jnp.stack([one, sign], -1), jnp.stack([sign, one], -1)], -2)
+
+
+def contradicted(
+    new: Lines, model: Lines, thresholds: Thresholds, rules: Rules, pose_error: PoseError
+) -> Bool[Array, " K"]:
+    """Which lines of the map a scan denies: where they are, it has seen others.
+
+    Args:
+      new: the `L` lines of the scan.
+      model: the `K` lines of the map.
+      thresholds: `match_...`.
+      rules: `tell_sides`.
+      pose_error: its model.
+
+    Returns:
+      For each line of the map whether a new one lies in its place that fails the gate of Eq. (22).
+    """
+
+    def denies(a: Lines, b: Lines) -> Bool[Array, ""]:
+        pair: LineComparison = compare_lines(a, b, thresholds, pose_error)
+        another = pair.in_place & (pair.nis >= thresholds.match_nis)
+        return another & (pair.sign > 0) if rules.tell_sides else another
+
+    return jnp.any(jax.vmap(jax.vmap(denies, (None, 0)), (0, None))(new, directed(model)), 0)
 
 
 @pytree

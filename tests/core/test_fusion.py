@@ -507,7 +507,7 @@ def fused_circle(model: Circles, new: Circles, rules: Rules, pose_error: PoseErr
         distance=jnp.abs(new.center[:, 0] - model.center[0, 0]),
         nis=jnp.zeros(k),
         dof=jnp.zeros(k, jnp.int32),
-        ambiguous=jnp.zeros(k, bool),
+        suspect=jnp.full(k, -1, jnp.int32),
     )
     return fuse_circles(model, new, matches, rules, pose_error)
 

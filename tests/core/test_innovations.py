@@ -86,4 +86,4 @@ def test_fitted_circles_are_compared_by_the_covariance_of_their_difference(pose_
         found = match_circles(at(1), at(0), gates, Rules(), pose_error)
         np.testing.assert_allclose(found.nis, [nis], rtol=1e-9)
         assert (int(found.slot[0]) == 0) == matched
-        assert bool(found.ambiguous[0]) != matched
+        assert found.suspect[0] == (-1 if matched else 0)

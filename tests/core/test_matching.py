@@ -214,7 +214,7 @@ def test_gates_of_circles(x: float, fitted: bool, options: dict[str, bool], slot
     new, model = poles_at([x, 0, 0.1], fitted=fitted), poles_at([[5, 5, 0.1], [0, 0, 0.1]], fitted=fitted)
     found = MATCH_CIRCLES(new, model, Thresholds(), rules=Rules(**options), pose_error="independent")
     assert found.slot.tolist() == [1 if slot == 0 else -1, -1, -1, -1]
-    assert found.ambiguous.tolist() == [ambiguous, False, False, False]
+    assert found.suspect.tolist() == [1 if ambiguous else -1, -1, -1, -1]
     assert found.distance[0] == pytest.approx(x if slot == 0 else 0)
     near = fitted and x < 0.3
     assert found.dof[0] == (3 if near else 0)
