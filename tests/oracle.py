@@ -1629,6 +1629,12 @@ def _contradicted(found: Lines, before: Lines, *, thresholds: Any, rules: Any, p
     return denied
 
 
+def _balance(slots: Any, size: np.ndarray, borne_out: set[int], denied: set[int]) -> float:
+    """What a scan bears out less what it denies, each by its size and by how often it was seen."""
+    weight = size * slots.times_detected
+    return float(weight[sorted(borne_out)].sum() - weight[sorted(denied - borne_out)].sum())
+
+
 def _give_way(slots: Any, against: set[int], borne_out: set[int], believed: bool, thresholds: Any) -> int:
     """Free what was contradicted too often, as Page's cumulated sum has it; how many went."""
     gone = 0
@@ -1933,7 +1939,7 @@ def _update_circles(
     targets: np.ndarray,
     measured: np.ndarray,
     triangles: list[np.ndarray],
-    evidence: tuple[float, float],
+    balance: float,
     report: Report,
     *,
     thresholds: Any,
@@ -1941,27 +1947,28 @@ def _update_circles(
     pose_error: PoseError,
     share: float,
 ) -> None:
-    """The circles of the scan into the map, after its lines; `evidence` in metres of these, for the map and against."""
+    """The circles of the scan into the map, after its lines; `balance` as `_balance` has it of these."""
     lines, circles, new = new_map.lines, new_map.circles, forget(found.circles, share)
     reach = float(thresholds.circle_line_distance)
 
     members: dict[int, list[tuple[float, int]]] = {}
     added = []
-    against, (agree, contradict) = set(), evidence
+    against, suspects = set(), set()
     for i in range(len(new.radius)):
         match, distance = match_circle(circles, new, i, thresholds=thresholds, rules=rules, pose_error=pose_error)
         report.circle_nis[i], report.circle_dof[i] = match.nis, match.dof
         if match.slot >= 0:
             report.circle_slot[i] = match.slot
             members.setdefault(match.slot, []).append((distance, i))
-            agree += 2 * new.radius[i]
         elif match.suspect < 0 or not rules.leave_out_ambiguous:
             added.append(i)
         else:
-            contradict += 2 * new.radius[i]
+            suspects.add(match.suspect)
             step = new.center[i] - circles.center[match.suspect]
             if math.hypot(*step) < new.radius[i] + circles.radius[match.suspect]:
                 against.add(match.suspect)
+
+    balance += _balance(circles, 2 * circles.radius, set(members), suspects)
 
     # What is about to be fused was seen, and is spared.
     for slot in np.flatnonzero(circles.valid).tolist():
@@ -1979,7 +1986,7 @@ def _update_circles(
         _fuse_circle(circles, slot, new, [i for _, i in sorted(assigned)], rules=rules, pose_error=pose_error)
         report.fused += 1
     if rules.give_way:
-        report.deleted += _give_way(circles, against, set(members), agree > contradict, thresholds)
+        report.deleted += _give_way(circles, against, set(members), balance > 0, thresholds)
 
     on_map = lines.take(np.flatnonzero(lines.valid))
     for i in added:
@@ -2098,10 +2105,11 @@ def update(
         ties=ties,
     )
 
-    agree, contradict = (float(found.lines.length[of].sum()) for of in (report.line_slot >= 0, suspects >= 0))
     against = _contradicted(
         forget(found.lines, share), before, thresholds=thresholds, rules=rules, pose_error=pose_error
     )
+    borne_out = set(report.line_slot.tolist()) - {NEW, LEFT_OUT}
+    balance = _balance(before, before.length, borne_out, against | set(suspects.tolist()) - {-1})
 
     if rules.merge:
         freed = _merge(lines, targets, pairs, thresholds=thresholds, rules=rules, pose_error=pose_error, ties=ties)
@@ -2109,7 +2117,7 @@ def update(
         for slots in (targets, suspects, report.line_slot):
             slots[:] = [freed.get(slot, slot) for slot in slots.tolist()]
     if rules.give_way:
-        report.deleted += _give_way(lines, against, set(targets.tolist()), agree > contradict, thresholds)
+        report.deleted += _give_way(lines, against, set(targets.tolist()), balance > 0, thresholds)
 
     own = np.where(targets >= 0, targets, suspects)
     label = found.line_of_beam[sweep.beam]
@@ -2135,7 +2143,7 @@ def update(
         targets,
         measured,
         triangles,
-        (agree, contradict),
+        balance,
         report,
         thresholds=thresholds,
         rules=rules,

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -201,8 +202,9 @@ def test_a_log_that_is_not_in_the_frame_of_the_map_is_told(built: Path, run: Any
 
 
 def test_maps_are_merged(built: Path, run: Any, tmp_path: Path) -> None:
-    status, out, err = run("merge", built / "a/map.json", built / "b/map.json", "-o", tmp_path / "ab", "--json")
-    assert (status, err) == (0, "")
+    maps = built / "a/map.json", built / "b/map.json"
+    status, out, err = run("merge", *maps, "-o", tmp_path / "ab", "--json")
+    assert status == 0
     summary, merged = json.loads(out), document(tmp_path / "ab/map.json")
     assert (
         summary["lines"]
@@ -214,6 +216,21 @@ def test_maps_are_merged(built: Path, run: Any, tmp_path: Path) -> None:
     east = [line for line in merged["lines"] if line["rho"] == pytest.approx(4, abs=0.05) and abs(line["theta"]) < 0.05]
     assert [line["times_detected"] for line in east] == [2 * SCANS]
     assert (tmp_path / "ab/map.png").is_file()
+
+    # What has moved is told; it stands where it was, too, unless the second map is said to be of a later drive.
+    moved = json.loads(run("compare", *maps, "--json")[1])["moved"]
+    told = Counter(change["kind"] for change in moved)
+    assert told["line"] >= 2
+    assert (summary["lines_moved"], summary["circles_moved"]) == (told["line"], told["circle"])
+    assert f"{told['line']} lines and {told['circle']} circles have moved from {maps[0]} to {maps[1]}" in err
+    status, out, err = run("merge", *maps, "-o", tmp_path / "later", "--json", "--later")
+    assert (status, err, json.loads(out)["lines_moved"]) == (0, "", told["line"])
+    was, now = (document(path / "map.json") for path in (tmp_path / "ab", tmp_path / "later"))
+    old = np.array([change["begin"] for change in moved if change["kind"] == "line"])
+    places = (np.array([line["begin"] for line in found["lines"]]) for found in (was, now))
+    stands = [(np.abs(old[:, None] - place[None]).max(-1) < 1e-6).any(1) for place in places]
+    assert (stands[0].any(), stands[1].any()) == (True, False)
+    assert now["lines"][-3:] == document(maps[1])["lines"][2:4] + document(maps[1])["lines"][-1:]
 
     far = document(built / "b/map.json")
     for line in far["lines"]:

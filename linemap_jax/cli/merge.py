@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from linemap_jax.core.state import LineMap
     from linemap_jax.lab.comparison import Agreement
 
+AT_LEAST = 3
+"""Scans that have detected what is told to have moved, as in `compare`."""
+
 
 LEAST_AGREEING = 0.2
 """Of the length of lines where two maps overlap, the share that lies along one of the other: of two drives of one place
@@ -32,6 +35,9 @@ class Merge:
     """Folder for the map; made if it is not there."""
     pose_error: Literal["independent", "unknown"] = "unknown"
     """How the errors of the two maps hang together. With `unknown` covariances are bounds that hold in any case."""
+    later: bool = False
+    """The second map is of a later drive: what `compare` says has moved is taken from it alone. What has vanished
+    stays, since a map does not tell what its drive has seen through."""
     overwrite: bool = False
     """Replace output that is there already."""
     quiet: bool = False
@@ -47,11 +53,20 @@ class Merge:
         from linemap_jax.core.merging import merge_maps
         from linemap_jax.io.map_file import write_map
         from linemap_jax.io.plot import plot_map
-        from linemap_jax.lab.comparison import agreement
+        from linemap_jax.lab.comparison import agreement, compare_maps, without_moved
 
-        merged, report = merge_maps(a, b, pose_error=self.pose_error)
+        changes = compare_maps(a, b, at_least=AT_LEAST).changes
+        merged, report = merge_maps(without_moved(a, changes) if self.later else a, b, pose_error=self.pose_error)
         joined = {name: int(getattr(report, name)) for name in ("lines_joined", "circles_joined", "circles_left_out")}
         warn_of_frames(self.a, self.b, agreement(a, b), quiet=self.quiet)
+        moved = [change.kind for change in changes if change.what == "moved"]
+        if moved and not self.later:
+            say(
+                f"warning: {moved.count('line')} lines and {moved.count('circle')} circles have moved from {self.a} to "
+                f"{self.b}, and the map mixes both places (--later takes them from the second one; `linemap compare` "
+                "tells which)",
+                quiet=self.quiet,
+            )
         make_folder(self.output)
         names = [str(each.get("log", path.name)) for each, path in zip(settings, (self.a, self.b), strict=True)]
         title = " + ".join(names)
@@ -63,6 +78,8 @@ class Merge:
             "b": {"map": str(self.b), **_counts(b)},
             **_counts(merged),
             **joined,
+            "lines_moved": moved.count("line"),
+            "circles_moved": moved.count("circle"),
             "map": str(map_file),
             "picture": str(picture),
         }

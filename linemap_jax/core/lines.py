@@ -521,9 +521,9 @@ def _near_ends(
     reach2 = thresholds.line_sigmas**2 * (noise.range_sigma**2 + (points.range * noise.bearing_sigma) ** 2)
     reach2 = WIDENED**2 * jnp.maximum(reach2, thresholds.line_distance**2)
     steps = points.position - ends[:, :2], points.position - ends[:, 2:]
-    near = (dot(steps[0], steps[0]) < reach2) | (dot(steps[1], steps[1]) < reach2)
+    near = (dot(steps[0], steps[0]) <= reach2) | (dot(steps[1], steps[1]) <= reach2)
     spare = jnp.maximum((size - jnp.maximum(jnp.ceil(LEAST_SHARE * size), MIN_POINTS)) // 2, 1)
-    return (runs.of_point >= 0) & ((from_end < 1) | (near & (from_end < runs.spread(spare))))
+    return (runs.of_point >= 0) & near & (from_end < runs.spread(spare))
 
 
 def _enough(count: Float[Array, " K"], size: Float[Array, " K"]) -> Bool[Array, " K"]:

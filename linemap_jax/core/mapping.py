@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from linemap_jax.core import fusion, matching, wiping
 from linemap_jax.core.circles import near_lines
@@ -219,8 +219,7 @@ class _LineUpdate(NamedTuple):
     fused: Array
     merged: Array
     gave_way: Array
-    for_the_map: Array  # m of the scan's lines that bear out lines of the map
-    against_it: Array  # m that contradict
+    balance: Array  # m times scans, of the lines that the scan bears out less those that it denies
     overflow: Array
 
 
@@ -267,11 +266,11 @@ def _update_lines(
         model, moved, merged = merge_lines(model, fused, touched, seen_apart, thresholds, rules, pose_error)
         targets = jnp.where(targets >= 0, moved[targets], targets)
         slot, suspect = (jnp.where(x >= 0, moved[x], x) for x in (slot, suspect))
-    for_the_map, against_it = (jnp.sum(jnp.where(x, new.length, 0)) for x in (has_prior, match.suspect >= 0))
-    gave_way = jnp.zeros((), jnp.int32)
+    gave_way, balance = jnp.zeros((), jnp.int32), jnp.zeros((), new.offset.dtype)
     if rules.give_way:
         denied = matching.contradicted(apart, before, thresholds, rules, pose_error)
-        model, gave_way = _give_way(model, denied & (for_the_map > against_it), targets, thresholds)
+        balance = _balance(before, before.length, match.slot, denied | _marked(match.suspect, denied.shape[0]))
+        model, gave_way = _give_way(model, denied & (balance > 0), targets, thresholds)
     return _LineUpdate(
         model=model,
         targets=targets,
@@ -283,8 +282,7 @@ def _update_lines(
         fused=jnp.sum(first & has_prior, dtype=jnp.int32),
         merged=merged,
         gave_way=gave_way,
-        for_the_map=for_the_map,
-        against_it=against_it,
+        balance=balance,
         overflow=overflow,
     )
 
@@ -308,6 +306,17 @@ def _give_way(
     gone = model.valid & (times > 0) & (times >= jnp.minimum(model.times_detected + 1, thresholds.contradictions))
     model = dataclasses.replace(model, times_contradicted=times, valid=model.valid & ~gone)
     return model, jnp.sum(gone, dtype=jnp.int32)
+
+
+def _balance(
+    model: SlotsT, size: Float[Array, " K"], bearing_out: Int[Array, " L"], denied: Bool[Array, " K"]
+) -> Float[Array, ""]:
+    """What a scan bears out of the map less what it denies, by size and by how often it was seen.
+
+    Where a scan denies more than it bears out, its pose is to blame, and not the map.
+    """
+    sign = jnp.where(_marked(bearing_out, denied.shape[0]), 1, jnp.where(denied, -1, 0))
+    return jnp.sum(sign * size * model.times_detected.astype(size.dtype))
 
 
 def _marked(slots: Int[Array, " L"], capacity: int) -> Bool[Array, " K"]:
@@ -464,13 +473,12 @@ def _update_circles(
     k = model.valid.shape[0]
     matched = _marked(match.slot, k)
     gone = gone & ~matched
-    model = fusion.fuse_circles(model, new, match, rules, pose_error)
+    before, model = model, fusion.fuse_circles(model, new, match, rules, pose_error)
     model = dataclasses.replace(model, valid=model.valid & ~gone)
     gave_way = jnp.zeros((), jnp.int32)
     if rules.give_way:
-        bearing_out, against = (jnp.sum(jnp.where(x >= 0, new.radius, 0)) for x in (match.slot, match.suspect))
-        agrees = seen.for_the_map + 2 * bearing_out > seen.against_it + 2 * against
-        denied = _marked(jnp.where(overlap, match.suspect, -1), k) & agrees
+        balance = seen.balance + _balance(before, 2 * before.radius, match.slot, _marked(match.suspect, k))
+        denied = _marked(jnp.where(overlap, match.suspect, -1), k) & (balance > 0)
         model, gave_way = _give_way(model, denied, match.slot, thresholds)
 
     fresh = new.valid & (match.slot < 0) & (match.suspect < 0) & ~near_lines(new, lines, thresholds, rules)

@@ -14,7 +14,7 @@ clusters too. Beams of its own drive tell.
 
 import dataclasses
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Literal, NamedTuple
 
 import jax
@@ -26,8 +26,8 @@ from linemap_jax.core.fields import documented
 from linemap_jax.core.frames import dot, unit
 from linemap_jax.core.matching import LineComparison, compare_lines, normal_variance
 from linemap_jax.core.settings import Mount, Thresholds
-from linemap_jax.core.slots import detected_often
-from linemap_jax.core.state import LineMap, Lines, Pose, Scan, pad_stack
+from linemap_jax.core.slots import detected_often, neutral_where_free
+from linemap_jax.core.state import LineMap, Lines, Pose, Scan, SlotsT, pad_stack
 from linemap_jax.lab.raycast import cast
 from linemap_jax.lab.world import NEVER, Kind, Poles, Segments, World
 
@@ -171,6 +171,26 @@ def compare_maps(
         return order[change.what], -far, -length
 
     return Comparison(sorted(changes, key=rank), int(held.any(1).sum()) - len(slid), same_circles, raw.size)
+
+
+def without_moved(a: LineMap, changes: Sequence[Change]) -> LineMap:
+    """The first map without what has moved from there.
+
+    Args:
+      a: the map before.
+      changes: by `compare_maps`, from this map to another one.
+
+    Returns:
+      The map, in the same slots.
+    """
+
+    def stay(slots: SlotsT, kind: Literal["line", "circle"]) -> SlotsT:
+        left = (change.slot_a for change in changes if change.what == "moved" and change.kind == kind)
+        moved = [slot for slot in left if slot is not None]
+        gone = np.isin(np.arange(slots.valid.shape[0]), moved)
+        return neutral_where_free(dataclasses.replace(slots, valid=slots.valid & ~gone))
+
+    return LineMap(lines=stay(a.lines, "line"), circles=stay(a.circles, "circle"))
 
 
 class Agreement(NamedTuple):
