@@ -17,6 +17,7 @@ import pytest
 import shapely
 
 from linemap_jax.cli import main, trials
+from linemap_jax.cli.calibrate import _in_words as _calibrated
 from linemap_jax.cli.options import MOST_SCANS, UsageError
 from linemap_jax.cli.worlds import WorldKind, made_world
 from linemap_jax.core.mapping import empty_map
@@ -420,6 +421,18 @@ def test_noise_is_told_from_a_log_and_taken_by_build(run, tmp_path: Path) -> Non
     for name, sigma in (("x_m", 0.02), ("y_m", 0.02), ("theta_rad", 0.004)):
         assert found[name]["from"] / 1.5 < sigma < found[name]["to"] * 1.5
     assert read_config(config)["noise"]["range_sigma"] == pytest.approx(found["range_m"]["sigma"], rel=1e-3)
+
+
+def test_what_a_log_does_not_tell_is_not_proposed() -> None:
+    names = "range_m", "bearing_rad", "x_m", "y_m", "theta_rad", "walls_m", "walls_rad"
+    rows = {name: {"sigma": 0.01, "from": 0.009, "to": 0.011} for name in names}
+    summary = {"beams": 9000, "lines": 300, "scans": 40}
+    *_, proposed = _calibrated(rows, summary).splitlines()
+    assert proposed == "--range-sigma 0.01 --bearing-sigma 0.01 --pose-sigma 0.01 0.01 0.01"
+    rows["x_m"] = {"sigma": 1e-6, "from": 1e-9, "to": 1e-3}
+    found = _calibrated(rows, summary).splitlines()
+    assert found[-1] == "--range-sigma 0.01 --bearing-sigma 0.01"
+    assert "  x        1e-06 m (not told by this log)" in found
 
 
 def test_what_no_noise_can_be_told_from_is_refused(refuse, tmp_path: Path, drive: Path) -> None:

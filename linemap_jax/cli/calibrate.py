@@ -2,8 +2,9 @@
 
 import dataclasses
 import json
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -11,6 +12,9 @@ from linemap_jax.cli.compilations import keep_compilations
 from linemap_jax.cli.logs import mount_of, opened, warn
 from linemap_jax.cli.options import MOST_SCANS, LogInput, UsageError, check_input, own_options_first
 from linemap_jax.cli.output import check_output, make_folder, say
+
+WIDEST = 100.0
+"""An interval that ends at so many times its begin tells nothing."""
 
 
 @own_options_first
@@ -77,22 +81,24 @@ class Calibrate(LogInput):
             make_folder(self.output.parent)
             with atomic_write(self.output, overwrite=self.overwrite) as path:
                 path.write_text(text, encoding="utf-8")
-        if self.json:
-            print(
-                json.dumps(rows | {"beams": sensor.used, "lines": poses.used, "scans": len(chunk.timestamps)}, indent=2)
-            )
-            return 0
-        sigmas = {name: f"{row['sigma']:.3g}" for name, row in rows.items()}
-        print(
-            f"from {sensor.used} beams and {poses.used} pairs of lines in {len(chunk.timestamps)} scans, "
-            "95 % intervals:"
-        )
-        for name, row in rows.items():
-            what, unit = name.split("_")
-            told = f"{row['from']:.3g} to {row['to']:.3g}" if row["to"] < 100 * row["from"] else "not told by this log"
-            print(f"  {what:8s} {sigmas[name]} {unit} ({told})")
-        print(
-            f"--range-sigma {sigmas['range_m']} --bearing-sigma {sigmas['bearing_rad']} "
-            f"--pose-sigma {sigmas['x_m']} {sigmas['y_m']} {sigmas['theta_rad']}"
-        )
+        summary = rows | {"beams": sensor.used, "lines": poses.used, "scans": len(chunk.timestamps)}
+        print(json.dumps(summary, indent=2) if self.json else _in_words(rows, summary))
         return 0
+
+
+def _in_words(rows: Mapping[str, Mapping[str, float]], summary: Mapping[str, Any]) -> str:
+    said = [
+        f"from {summary['beams']} beams and {summary['lines']} pairs of lines in {summary['scans']} scans, "
+        "95 % intervals:"
+    ]
+    told = [name for name, row in rows.items() if row["to"] < WIDEST * row["from"]]
+    sigmas = {name: f"{row['sigma']:.3g}" for name, row in rows.items()}
+    for name, row in rows.items():
+        what, unit = name.split("_")
+        interval = f"{row['from']:.3g} to {row['to']:.3g}" if name in told else "not told by this log"
+        said.append(f"  {what:8s} {sigmas[name]} {unit} ({interval})")
+    options = f"--range-sigma {sigmas['range_m']} --bearing-sigma {sigmas['bearing_rad']}"
+    of_pose = "x_m", "y_m", "theta_rad"
+    if all(name in told for name in of_pose):
+        options += f" --pose-sigma {' '.join(sigmas[name] for name in of_pose)}"
+    return "\n".join([*said, options])
