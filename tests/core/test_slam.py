@@ -365,6 +365,10 @@ def test_poses_and_lines_adjusted_together() -> None:
     np.testing.assert_allclose(np.stack([done.lines.offset, done.lines.angle], -1)[:3].ravel(), flat[-6:], atol=2e-5)
     cov = np.linalg.inv(jac.T @ jac) * max(float(done.unit_variance), 1)
     np.testing.assert_allclose(done.lines.cov[2], cov[-2:, -2:], rtol=1e-3)
+    # At poses that are known, the line would err by the noise of its own sightings alone.
+    own = np.linalg.inv(jac[:, -2:].T @ jac[:, -2:]) * max(float(done.unit_variance), 1)
+    np.testing.assert_allclose(done.lines.cov_independent[2], own, rtol=1e-3, atol=1e-12)
+    assert float(squared(done.lines.sqrt_persistent)[2, 0, 0]) > own[0, 0]
     np.testing.assert_allclose(done.cov_poses[count - 1], cov[114:117, 114:117], rtol=1e-3, atol=1e-9)
 
     # Sightings that fit better than they say make nothing better known than they say.
