@@ -1635,19 +1635,17 @@ def _balance(slots: Any, size: np.ndarray, borne_out: set[int], denied: set[int]
     return float(weight[sorted(borne_out)].sum() - weight[sorted(denied - borne_out)].sum())
 
 
-def _give_way(slots: Any, against: set[int], borne_out: set[int], believed: bool, thresholds: Any) -> int:
-    """Free what was contradicted too often, as Page's cumulated sum has it; how many went."""
-    gone = 0
-    for slot in np.flatnonzero(slots.valid).tolist():
-        times = int(slots.times_contradicted[slot])
-        if slot in borne_out:
-            times = max(times - 1, 0)
-        elif slot in against and believed:
-            times += 1
-        slots.times_contradicted[slot] = times
-        if times and (times > slots.times_detected[slot] or times >= float(thresholds.contradictions)):
+def _give_way(slots: Any, against: set[int], borne_out: set[int], thresholds: Any) -> set[int]:
+    """Free what was contradicted too often, as Page's cumulated sum has it; which went."""
+    gone = set()
+    for slot in borne_out:
+        slots.times_contradicted[slot] = max(slots.times_contradicted[slot] - 1, 0)
+    for slot in against - borne_out:
+        slots.times_contradicted[slot] += 1
+        times = slots.times_contradicted[slot]
+        if times > slots.times_detected[slot] or times >= float(thresholds.contradictions):
             _free(slots, slot)
-            gone += 1
+            gone.add(slot)
     return gone
 
 
@@ -1953,7 +1951,7 @@ def _update_circles(
 
     members: dict[int, list[tuple[float, int]]] = {}
     added = []
-    against, suspects = set(), set()
+    against, suspected = set(), []
     for i in range(len(new.radius)):
         match, distance = match_circle(circles, new, i, thresholds=thresholds, rules=rules, pose_error=pose_error)
         report.circle_nis[i], report.circle_dof[i] = match.nis, match.dof
@@ -1963,12 +1961,12 @@ def _update_circles(
         elif match.suspect < 0 or not rules.leave_out_ambiguous:
             added.append(i)
         else:
-            suspects.add(match.suspect)
+            suspected.append((match.suspect, i))
             step = new.center[i] - circles.center[match.suspect]
             if math.hypot(*step) < new.radius[i] + circles.radius[match.suspect]:
                 against.add(match.suspect)
 
-    balance += _balance(circles, 2 * circles.radius, set(members), suspects)
+    balance += _balance(circles, 2 * circles.radius, set(members), {slot for slot, _ in suspected})
 
     # What is about to be fused was seen, and is spared.
     for slot in np.flatnonzero(circles.valid).tolist():
@@ -1981,12 +1979,15 @@ def _update_circles(
         if gone:
             _free(circles, slot)
             report.deleted += 1
+            against.discard(slot)
 
+    if rules.give_way:
+        gone = _give_way(circles, against if balance > 0 else set(), set(members), thresholds)
+        added = sorted([*added, *(i for slot, i in suspected if slot in gone)])
+        report.deleted += len(gone)
     for slot, assigned in members.items():
         _fuse_circle(circles, slot, new, [i for _, i in sorted(assigned)], rules=rules, pose_error=pose_error)
         report.fused += 1
-    if rules.give_way:
-        report.deleted += _give_way(circles, against, set(members), balance > 0, thresholds)
 
     on_map = lines.take(np.flatnonzero(lines.valid))
     for i in added:
@@ -2085,14 +2086,14 @@ def update(
         if len(sweep.r):
             drifted = float(persistence.correlation) ** 2
             new_map = OracleMap(lines=forget(new_map.lines, drifted), circles=forget(new_map.circles, drifted))
-    lines, before = new_map.lines, _copy(new_map.lines)
+    lines = new_map.lines
     if not rules.share_pose:
         found = dataclasses.replace(found, lines=forget(found.lines, 0.0))
     pairs = pairs_of(found.lines, thresholds=thresholds)
 
     into = _lines_one_by_one if mode == "sequential" else _lines_at_once
     ties = Margin()
-    targets, suspects, triangles = into(
+    targets, suspects, triangles, balance = into(
         lines,
         found,
         pairs,
@@ -2105,19 +2106,11 @@ def update(
         ties=ties,
     )
 
-    against = _contradicted(
-        forget(found.lines, share), before, thresholds=thresholds, rules=rules, pose_error=pose_error
-    )
-    borne_out = set(report.line_slot.tolist()) - {NEW, LEFT_OUT}
-    balance = _balance(before, before.length, borne_out, against | set(suspects.tolist()) - {-1})
-
     if rules.merge:
         freed = _merge(lines, targets, pairs, thresholds=thresholds, rules=rules, pose_error=pose_error, ties=ties)
         report.merged += len(freed)
         for slots in (targets, suspects, report.line_slot):
             slots[:] = [freed.get(slot, slot) for slot in slots.tolist()]
-    if rules.give_way:
-        report.deleted += _give_way(lines, against, set(targets.tolist()), balance > 0, thresholds)
 
     own = np.where(targets >= 0, targets, suspects)
     label = found.line_of_beam[sweep.beam]
@@ -2167,12 +2160,12 @@ def _lines_at_once(
     pose_error: PoseError,
     share: float,
     ties: Margin,
-) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+) -> tuple[np.ndarray, np.ndarray, list[np.ndarray], float]:
     """Match all new lines against the map as it stood, then fuse and add.
 
     Returns:
       For each new line the slot that it went into and the slot that it was suspected to be (-1: none), and no
-      triangles: they are drawn later.
+      triangles: they are drawn later; and the balance of the scan.
     """
     n, view = len(found.lines.offset), Viewpoint(sweep.p, sweep.cov_pose)
     new, slots = forget(found.lines, share), np.flatnonzero(lines.valid)
@@ -2180,6 +2173,16 @@ def _lines_at_once(
     matches = [match_line(new.take(i), lines, slots, **matching) for i in range(n)]
     if rules.share_pose:
         matches = part(matches, pairs)
+
+    balance = 0.0
+    if rules.give_way:
+        borne_out = {match.slot for match in matches} - {-1}
+        against = _contradicted(new, lines, thresholds=thresholds, rules=rules, pose_error=pose_error)
+        suspected = {match.suspect for match in matches} - {-1} if rules.leave_out_ambiguous else set()
+        balance = _balance(lines, lines.length, borne_out, against | suspected)
+        gone = _give_way(lines, against if balance > 0 else set(), borne_out, thresholds)
+        matches = [match._replace(suspect=-1) if match.suspect in gone else match for match in matches]
+        report.deleted += len(gone)
 
     targets, suspects = np.full(n, -1), np.full(n, -1)
     pieces: dict[int, list[int]] = {}
@@ -2208,7 +2211,7 @@ def _lines_at_once(
         _add(lines, slot, found.lines.take(index), share=share, thresholds=thresholds, view=first_view)
         targets[index], report.line_slot[index] = slot, NEW
         report.added += 1
-    return targets, suspects, []
+    return targets, suspects, [], balance
 
 
 def _lines_one_by_one(
@@ -2223,7 +2226,7 @@ def _lines_one_by_one(
     pose_error: PoseError,
     share: float,
     ties: Margin,
-) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+) -> tuple[np.ndarray, np.ndarray, list[np.ndarray], float]:
     """The order of the paper: each new line is matched, fused or added, and wipes, before the next one.
 
     With `share_pose` a line that the scan has seen beside a line before it is not held against what that one went into.
@@ -2231,7 +2234,7 @@ def _lines_one_by_one(
 
     Returns:
       For each new line the slot that it went into and the slot that it was suspected to be (-1: none, or that line is
-      gone again), and the triangles that have wiped.
+      gone again), the triangles that have wiped, and no balance: nothing gives way.
     """
     n, view = len(found.lines.offset), Viewpoint(sweep.p, sweep.cov_pose)
     new = forget(found.lines, share)
@@ -2279,4 +2282,4 @@ def _lines_one_by_one(
             targets[targets == slot] = -1
             suspects[suspects == slot] = -1
             added.discard(slot)
-    return targets, suspects, triangles
+    return targets, suspects, triangles, 0.0

@@ -240,7 +240,14 @@ def _update_lines(
     pair = matching.compare_pieces(new, thresholds)
     apart = fusion.forget(new, share)
     match = matching.match_lines(apart, model, pair.collinear, thresholds, rules, pose_error)
-    unmatched = new.valid & (match.slot < 0) & (match.suspect < 0)
+    suspect = match.suspect
+    gave_way, balance = jnp.zeros((), jnp.int32), jnp.zeros((), new.offset.dtype)
+    if rules.give_way:
+        denied = matching.contradicted(apart, model, thresholds, rules, pose_error)
+        balance = _balance(model, model.length, match.slot, denied | _marked(suspect, denied.shape[0]))
+        model, gave_way = _give_way(model, denied & (balance > 0), match.slot, thresholds)
+        suspect = jnp.where(model.valid[suspect], suspect, -1)  # what takes its place is new
+    unmatched = new.valid & (match.slot < 0) & (suspect < 0)
     leader = matching.group_lines(pair, unmatched, thresholds)
 
     has_prior = match.slot >= 0
@@ -254,11 +261,10 @@ def _update_lines(
     fused = fusion.fuse_lines(mine, has_prior, new, together, thresholds, rules, pose_error, share)
     # All pieces of a line have the same result; the first one writes it.
     first = first_of_group(together)
-    before, model = model, put(model, jnp.where(first, targets, -1), fused)
+    model = put(model, jnp.where(first, targets, -1), fused)
 
     slot = jnp.where(leader >= 0, NEW, match.slot)
     slot = jnp.where(targets < 0, LEFT_OUT, slot)
-    suspect = match.suspect
     merged = jnp.zeros((), jnp.int32)
     if rules.merge:
         seen_apart = _mark(~pair.collinear, targets, model.valid.shape[0])
@@ -266,11 +272,6 @@ def _update_lines(
         model, moved, merged = merge_lines(model, fused, touched, seen_apart, thresholds, rules, pose_error)
         targets = jnp.where(targets >= 0, moved[targets], targets)
         slot, suspect = (jnp.where(x >= 0, moved[x], x) for x in (slot, suspect))
-    gave_way, balance = jnp.zeros((), jnp.int32), jnp.zeros((), new.offset.dtype)
-    if rules.give_way:
-        denied = matching.contradicted(apart, before, thresholds, rules, pose_error)
-        balance = _balance(before, before.length, match.slot, denied | _marked(match.suspect, denied.shape[0]))
-        model, gave_way = _give_way(model, denied & (balance > 0), targets, thresholds)
     return _LineUpdate(
         model=model,
         targets=targets,
@@ -288,22 +289,23 @@ def _update_lines(
 
 
 def _give_way(
-    model: SlotsT, denied: Bool[Array, " K"], targets: Int[Array, " L"], thresholds: Thresholds
+    model: SlotsT, denied: Bool[Array, " K"], bearing_out: Int[Array, " L"], thresholds: Thresholds
 ) -> tuple[SlotsT, Int[Array, ""]]:
     """Let go of what scans contradict: Page's test, of those that deny it against those that bear it out.
 
     Args:
       model: lines or circles of the map.
       denied: which of them the scan denies.
-      targets: for each primitive of the scan the slot of the one that it is part of, -1 for none.
+      bearing_out: for each primitive of the scan the slot of the one that it matches, -1 for none.
       thresholds: `contradictions`.
 
     Returns:
       The lines or circles, and how many are gone.
     """
-    less = jnp.where(_marked(targets, denied.shape[0]), -1, denied.astype(jnp.int32))
-    times = jnp.maximum(model.times_contradicted + less, 0)
-    gone = model.valid & (times > 0) & (times >= jnp.minimum(model.times_detected + 1, thresholds.contradictions))
+    borne_out = _marked(bearing_out, denied.shape[0])
+    times = jnp.maximum(model.times_contradicted + jnp.where(borne_out, -1, denied.astype(jnp.int32)), 0)
+    enough = times >= jnp.minimum(model.times_detected + 1, thresholds.contradictions)
+    gone = model.valid & denied & ~borne_out & enough
     model = dataclasses.replace(model, times_contradicted=times, valid=model.valid & ~gone)
     return model, jnp.sum(gone, dtype=jnp.int32)
 
@@ -467,21 +469,22 @@ def _update_circles(
     """Section 5.2: match, then fuse or add; and none too close to a line."""
     new = fusion.forget(found.circles, share)
     match = matching.match_circles(new, model, thresholds, rules, pose_error)
-    suspect = take(model, match.suspect)
-    step = new.center - suspect.center
-    overlap = dot(step, step) < jnp.square(new.radius + suspect.radius)
     k = model.valid.shape[0]
     matched = _marked(match.slot, k)
     gone = gone & ~matched
-    before, model = model, fusion.fuse_circles(model, new, match, rules, pose_error)
-    model = dataclasses.replace(model, valid=model.valid & ~gone)
-    gave_way = jnp.zeros((), jnp.int32)
+    suspect, gave_way = match.suspect, jnp.zeros((), jnp.int32)
     if rules.give_way:
-        balance = seen.balance + _balance(before, 2 * before.radius, match.slot, _marked(match.suspect, k))
-        denied = _marked(jnp.where(overlap, match.suspect, -1), k) & (balance > 0)
+        other = take(model, suspect)
+        step = new.center - other.center
+        overlap = dot(step, step) < jnp.square(new.radius + other.radius)
+        balance = seen.balance + _balance(model, 2 * model.radius, match.slot, _marked(suspect, k))
+        denied = _marked(jnp.where(overlap, suspect, -1), k) & (balance > 0) & ~gone
         model, gave_way = _give_way(model, denied, match.slot, thresholds)
+        suspect = jnp.where(model.valid[suspect], suspect, -1)
+    model = fusion.fuse_circles(model, new, match, rules, pose_error)
+    model = dataclasses.replace(model, valid=model.valid & ~gone)
 
-    fresh = new.valid & (match.slot < 0) & (match.suspect < 0) & ~near_lines(new, lines, thresholds, rules)
+    fresh = new.valid & (match.slot < 0) & (suspect < 0) & ~near_lines(new, lines, thresholds, rules)
     slot, overflow = free_slots(fresh, model.valid)
     # A circle that is not fitted is the visible arc and moves with the viewpoint: its covariance is this scan's alone.
     names = ("cov_independent", "sqrt_persistent")
