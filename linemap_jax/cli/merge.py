@@ -36,8 +36,8 @@ class Merge:
     pose_error: Literal["independent", "unknown"] = "unknown"
     """How the errors of the two maps hang together. With `unknown` covariances are bounds that hold in any case."""
     later: bool = False
-    """The second map is of a later drive: what `compare` says has moved is taken from it alone. What has vanished
-    stays, since a map does not tell what its drive has seen through."""
+    """The second map is of a later drive: it is believed where the two contradict each other. What has vanished stays,
+    since a map does not tell what its drive has seen through."""
     overwrite: bool = False
     """Replace output that is there already."""
     quiet: bool = False
@@ -56,7 +56,7 @@ class Merge:
         from linemap_jax.lab.comparison import agreement, compare_maps, without_moved
 
         changes = compare_maps(a, b, at_least=AT_LEAST).changes
-        merged, report = merge_maps(without_moved(a, changes) if self.later else a, b, pose_error=self.pose_error)
+        merged, report = merge_maps(without_moved(a, b, changes) if self.later else a, b, pose_error=self.pose_error)
         joined = {name: int(getattr(report, name)) for name in ("lines_joined", "circles_joined", "circles_left_out")}
         warn_of_frames(self.a, self.b, agreement(a, b), quiet=self.quiet)
         moved = [change.kind for change in changes if change.what == "moved"]

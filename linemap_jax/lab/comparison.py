@@ -24,8 +24,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from linemap_jax.core.fields import documented
 from linemap_jax.core.frames import dot, unit
-from linemap_jax.core.matching import LineComparison, compare_lines, normal_variance
-from linemap_jax.core.settings import Mount, Thresholds
+from linemap_jax.core.matching import LineComparison, compare_lines, contradicted, match_circles, normal_variance
+from linemap_jax.core.settings import Mount, Rules, Thresholds
 from linemap_jax.core.slots import detected_often, neutral_where_free
 from linemap_jax.core.state import LineMap, Lines, Pose, Scan, SlotsT, pad_stack
 from linemap_jax.lab.raycast import cast
@@ -173,24 +173,39 @@ def compare_maps(
     return Comparison(sorted(changes, key=rank), int(held.any(1).sum()) - len(slid), same_circles, raw.size)
 
 
-def without_moved(a: LineMap, changes: Sequence[Change]) -> LineMap:
-    """The first map without what has moved from there.
+def without_moved(a: LineMap, b: LineMap, changes: Sequence[Change]) -> LineMap:
+    """The first map without what is elsewhere in the second one.
+
+    That is what has surely moved; and what another line or circle stands in the place of, by the gate of Eq. (22),
+    though it may be by chance: one in a hundred of those that are where they were.
 
     Args:
       a: the map before.
-      changes: by `compare_maps`, from this map to another one.
+      b: the map after, in the same frame.
+      changes: by `compare_maps` of the two.
 
     Returns:
       The map, in the same slots.
     """
+    dtype = a.lines.offset.dtype
+    gates = jax.tree.map(lambda x: jnp.asarray(x, dtype), Thresholds())
+    denied_lines, suspects = jax.tree.map(np.asarray, _denied(a, b, gates))
+    denied = {"line": np.flatnonzero(denied_lines).tolist(), "circle": suspects[suspects >= 0].tolist()}
 
     def stay(slots: SlotsT, kind: Literal["line", "circle"]) -> SlotsT:
-        left = (change.slot_a for change in changes if change.what == "moved" and change.kind == kind)
-        moved = [slot for slot in left if slot is not None]
-        gone = np.isin(np.arange(slots.valid.shape[0]), moved)
+        moved = (change.slot_a for change in changes if change.what == "moved" and change.kind == kind)
+        left = [*denied[kind], *(slot for slot in moved if slot is not None)]
+        gone = np.isin(np.arange(slots.valid.shape[0]), left)
         return neutral_where_free(dataclasses.replace(slots, valid=slots.valid & ~gone))
 
     return LineMap(lines=stay(a.lines, "line"), circles=stay(a.circles, "circle"))
+
+
+@jax.jit
+def _denied(a: LineMap, b: LineMap, gates: Thresholds) -> tuple[Bool[Array, " K"], Int[Array, " D"]]:
+    """Which lines of `a` lie where `b` has others; and of which circle of `a` each one of `b` takes the place."""
+    lines = contradicted(b.lines, a.lines, gates, Rules(), "unknown")
+    return lines, match_circles(b.circles, a.circles, gates, Rules(), "unknown").suspect
 
 
 class Agreement(NamedTuple):

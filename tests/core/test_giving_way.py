@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from maps import lines_between, poles_at
 
 from linemap_jax import Capacity, LineMap, Pose, Report, Rules, Scan, SensorNoise, Thresholds, empty_map, update
 from linemap_jax.core.mapping import _give_way
 from linemap_jax.core.matching import contradicted
-from tests.maps import lines_between, poles_at
 
 BEARINGS = np.radians(np.arange(-90, 90.25, 0.5))
 NOISE = SensorNoise(range_sigma=0.005, bearing_sigma=0.0005)

@@ -12,7 +12,7 @@ from maps import lines_between, poles_at
 from scipy import stats
 
 from linemap_jax.core.state import LineMap, Pose, Scan
-from linemap_jax.lab.comparison import Change, Comparison, agreement, compare_maps, holm, looked_through
+from linemap_jax.lab.comparison import Change, Comparison, agreement, compare_maps, holm, looked_through, without_moved
 
 SIGMA = 0.01, 0.003
 ROOM = [(-5, -4), (5, -4), (5, 4), (-5, 4)]
@@ -195,6 +195,26 @@ def test_circles_without_a_covariance_are_the_same_if_their_discs_are_near(
     found = compare_maps(*maps)
     assert found.same_circles == same
     assert [change.what for change in found.changes] == ([] if same else ["vanished", "appeared"])
+
+
+def test_what_is_elsewhere_leaves_the_first_map_whether_it_is_told_or_not() -> None:
+    """Of forty walls one has moved by 3.5 sigma, which is too little to tell of among so many; so has a pole."""
+    at = 3.0 * np.arange(40)
+    walls = np.stack([np.stack([at, np.zeros(40)], -1), np.stack([at, np.full(40, 2.0)], -1)], 1)
+    later = walls.copy()
+    later[7, :, 0] += 3.5 * 0.01 * math.sqrt(2)
+    later[11, :, 0] += 0.3
+    poles = np.stack([at[:3] + 1.5, np.ones(3), np.full(3, 0.1)], -1)
+    shift = [[0.0, 0.0, 0.0], [3.8 * 0.01 * math.sqrt(2), 0.0, 0.0], [0.0, 0.0, 0.0]]
+    a = LineMap(lines=lines_between(walls, room=40), circles=poles_at(poles))
+    b = LineMap(lines=lines_between(later, room=40), circles=poles_at(poles + shift))
+    changes = compare_maps(a, b).changes
+    assert [change.slot_a for change in changes if change.kind == "line"] == [11]
+    assert not told(Comparison(changes, 0, 0, 0), "moved", "circle")
+    left = without_moved(a, b, changes)
+    gone = set(range(40)) - set(np.flatnonzero(left.lines.valid).tolist())
+    assert gone == {7, 11}
+    assert np.flatnonzero(left.circles.valid).tolist() == [0, 2]
 
 
 def test_holm() -> None:
