@@ -15,7 +15,7 @@ from PIL import Image
 
 from linemap_jax.cli import main
 from linemap_jax.cli.compare import _in_words
-from linemap_jax.cli.resume import differences
+from linemap_jax.cli.resume import differences, map_to_resume
 from linemap_jax.core.settings import PAPER_RULES, Rules, SensorNoise
 from linemap_jax.io.exports import FORMATS
 from linemap_jax.lab.comparison import Change, Comparison
@@ -124,6 +124,15 @@ def test_resumed_it_is_the_map_of_one_drive(built: Path, run: Any, tmp_path: Pat
     for kind in ("lines", "circles"):  # the slots may differ
         assert sorted(map(json.dumps, resumed[kind])) == sorted(map(json.dumps, whole[kind]))
     assert resumed["settings"]["resumed_from"] == "one.log"
+
+
+def test_what_persists_is_another_error_in_the_map_of_another_model(built: Path) -> None:
+    kept, taken = (
+        map_to_resume(built / "a/map.json", "float32", model).line_map.lines for model in ("unknown", "persistent")
+    )
+    assert np.any(kept.sqrt_persistent)
+    assert not np.any(taken.sqrt_persistent)
+    np.testing.assert_allclose(taken.cov, kept.cov, rtol=1e-6)
 
 
 def test_other_settings_are_told() -> None:

@@ -10,7 +10,7 @@ import tyro
 
 from linemap_jax.cli.fit import Fit, at_poses_of_map
 from linemap_jax.cli.logs import mount_of, opened, plain_chunks, progress, warn
-from linemap_jax.cli.merge import read_two_maps, warn_of_frames
+from linemap_jax.cli.merge import AT_LEAST, read_two_maps, warn_of_frames
 from linemap_jax.cli.options import LogInput, UsageError, check_input, own_options_first
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ class Compare(LogInput):
     """Probability of telling of any movement where there is none, given which thing is held against which."""
     shortest: Annotated[float, tyro.conf.arg(metavar="M")] = 0.5
     """Shortest piece of a line that is told to have vanished or appeared, m."""
-    at_least: Annotated[int, tyro.conf.arg(metavar="N")] = 3
+    at_least: Annotated[int, tyro.conf.arg(metavar="N")] = AT_LEAST
     """Of lines and circles that were detected more seldom no change is told."""
     quiet: bool = False
     """No progress, no warnings."""

@@ -15,8 +15,7 @@ if TYPE_CHECKING:
     from linemap_jax.lab.comparison import Agreement
 
 AT_LEAST = 3
-"""Scans that have detected what is told to have moved, as in `compare`."""
-
+"""Scans that have detected what is told to have moved."""
 
 LEAST_AGREEING = 0.2
 """Of the length of lines where two maps overlap, the share that lies along one of the other: of two drives of one place

@@ -193,7 +193,7 @@ class Lines:
     times_detected: Int[Array, " K"]
     """How many scans have seen the line."""
     times_contradicted: Int[Array, " K"]
-    """How many scans have seen another line in its place since one has seen it."""
+    """How many more scans have seen another line in its place than have since seen it, or 0."""
     valid: Bool[Array, " K"]
     """Which slots are in use."""
 
@@ -269,7 +269,7 @@ class Circles:
     times_detected: Int[Array, " K"]
     """How many scans have seen the circle."""
     times_contradicted: Int[Array, " K"]
-    """How many scans have seen another circle in its place since one has seen it."""
+    """How many more scans have seen another circle in its place than have since seen it, or 0."""
     valid: Bool[Array, " K"]
     """Which slots are in use."""
 
