@@ -1620,12 +1620,20 @@ def _merge(
 
 
 def _contradicted(found: Lines, before: Lines, *, thresholds: Any, rules: Any, pose_error: PoseError) -> set[int]:
-    """Slots of lines of which a line of the scan covers half, from the same side, and fails Eq. (22)."""
-    slots, denied = np.flatnonzero(before.valid), set()
-    for i in range(len(found.offset)):
-        g = gates(found.take(i), before.take(slots), thresholds=thresholds, pose_error=pose_error)
-        faces = (g.sign > 0) | (not rules.tell_sides)
-        denied |= set(slots[g.same_line & faces & ~g.statistical & (2 * g.covered > before.length[slots])].tolist())
+    """Slots of lines whose middle a line of the scan passes nearest that covers half of them, but fails Eq. (22)."""
+    denied = set()
+    for slot in np.flatnonzero(before.valid).tolist():
+        line = before.take(slot)
+        middle = (line.begin + line.end) / 2 - found.anchor
+        along, across = dot(middle, found.tangent), np.abs(dot(middle, found.normal) - found.offset)
+        passes = (found.extent[:, 0] < along) & (along < found.extent[:, 1])
+        faces = (dot(found.normal, line.normal) > 0) | (not rules.tell_sides)
+        if not (passes & faces).any():
+            continue
+        nearest = int(np.argmin(np.where(passes & faces, across, np.inf)))
+        g = gates(found.take(nearest), line, thresholds=thresholds, pose_error=pose_error)
+        if g.same_line[0] and not g.statistical[0] and 2 * g.covered[0] > line.length[0]:
+            denied.add(slot)
     return denied
 
 

@@ -64,11 +64,15 @@ def earliest_true(which: Bool[Array, " N"]) -> Int[Array, " N"]:
     return which.shape[0] - 1 - latest_true(which[::-1])[::-1]
 
 
-def least(score: Float[Array, "L K"]) -> tuple[Int[Array, " L"], Float[Array, " L"]]:
-    """Where in each row of `score` the least number stands, the first of equal ones, and that number."""
-    value = jnp.min(score, -1)
-    index = jnp.arange(score.shape[1], dtype=jnp.int32)[None]
-    return jnp.min(jnp.where(score == value[:, None], index, score.shape[1] - 1), -1), value
+def least(score: Float[Array, "L K"], axis: int = 1) -> tuple[Int[Array, " M"], Float[Array, " M"]]:
+    """Where in each row of `score` the least number stands, the first of equal ones, and that number.
+
+    With `axis` 0 in each column: faster than in each row of the transposed, since cells that lie side by side are then
+    taken at once.
+    """
+    value = jnp.min(score, axis, keepdims=True)
+    index = jax.lax.broadcasted_iota(jnp.int32, score.shape, axis)
+    return jnp.min(jnp.where(score == value, index, score.shape[axis] - 1), axis), jnp.squeeze(value, axis)
 
 
 def free_slots(wanted: Bool[Array, " M"], taken: Bool[Array, " K"]) -> tuple[Int[Array, " M"], Bool[Array, ""]]:

@@ -176,6 +176,8 @@ def test_another_line_in_the_place_of_one() -> None:
         new = lines_between([ends], sigma=(0.002, 0.001), room=2)
         found = look(new, model, Thresholds(), rules=Rules(), pose_error="unknown")
         assert found.tolist() == expected, name
+    both = lines_between([[[0, 0.03], [2, 0.03]], [[0.9, 0.004], [3, 0.004]]], sigma=(0.002, 0.001), room=2)
+    assert not look(both, model, Thresholds(), rules=Rules(), pose_error="unknown").any()  # the nearer one decides
     behind = lines_between([cases["from behind"][0]], sigma=(0.002, 0.001), room=2)
     found = look(behind, model, Thresholds(), rules=Rules(tell_sides=False), pose_error="unknown")
     assert found.tolist() == [True, False, False]
