@@ -280,8 +280,7 @@ def localize(
     rules = method.get("rules", Rules())
     lines = directed(line_map.lines)
 
-    def step(belief: Belief, x: tuple[Scan, Array, Array, Array]) -> tuple[Belief, Located]:
-        scan, move, more, is_active = x
+    def after_scan(belief: Belief, scan: Scan, move: Array, more: Array) -> tuple[Belief, Located]:
         finite = jnp.all(jnp.isfinite(move))
         expected = predict(belief, jnp.where(finite, move, 0), more, odometry)
         seen = observe(scan, mount, thresholds=thresholds, noise=noise, capacity=capacity, **method)
@@ -299,8 +298,16 @@ def localize(
             settings=settings,
         )
         status = located.status | jnp.where(finite, 0, int(Status.POSE_NOT_FINITE))
-        after = jax.tree.map(lambda a, b: jnp.where(is_active, a, b), after, belief)
         return after, dataclasses.replace(located, status=status)
+
+    def after_none(belief: Belief, *_: Any) -> tuple[Belief, Located]:
+        zero, none = jnp.zeros_like(belief.fit), jnp.zeros((), jnp.int32)
+        nothing = Located(pose=belief.pose, nis=zero, dof=none, lines=none, circles=none, fit=zero, status=none)
+        return belief, nothing
+
+    def step(belief: Belief, x: tuple[Scan, Array, Array, Array]) -> tuple[Belief, Located]:
+        *given, is_active = x
+        return jax.lax.cond(is_active, after_scan, after_none, belief, *given)
 
     return jax.lax.scan(step, belief, (scans, steps, extra, active))
 
@@ -424,7 +431,7 @@ def locate(
         sightings = gated(judged_by, at, _packed([by_lines, by_circles, by_points]), settings.match_nis)
         # Nor may a thing pull the pose away from where it can be: a pole that was moved fits, once it has.
         sightings = gated(prior, at, sightings, settings.match_nis)
-        after, nis = update(prior, at, sightings)
+        after, sightings, nis = update_with_consistent(prior, at, sightings, settings.match_nis)
         return after.mean, after, sightings, nis
 
     def points_from(at: Float[Array, "3"]) -> Sightings:
@@ -721,17 +728,43 @@ def gated(belief: Belief, at: Float[Array, "3"], sightings: Sightings, most: Num
     """
     innovation = sightings.innovation - jnp.sum(sightings.jac_pose * _minus(at, belief.mean)[None, None], -1)
     nis = quadratic(innovation, inverse(innovation_cov(belief, sightings)))
-    return _where(
-        sightings.valid & (nis < most),
-        slot=sightings.slot,
-        innovation=sightings.innovation,
-        jac_pose=sightings.jac_pose,
-        by_map=sightings.by_map,
-        cov=sightings.cov,
-    )
+    return _only(sightings, nis < most)
 
 
-def update(belief: Belief, at: Float[Array, "3"], sightings: Sightings) -> tuple[Belief, Float[Array, ""]]:
+def update_with_consistent(
+    belief: Belief, at: Float[Array, "3"], sightings: Sightings, most: Number
+) -> tuple[Belief, Sightings, Float[Array, ""]]:
+    """The belief after those sightings that agree with each other: Baarda's data snooping.
+
+    What has moved may lie where a prediction has it that knows little of the heading, and pull the pose until it fits
+    and nothing else does. The rest of the scan tells: as long as there is a sighting that the belief and all others
+    together say to be impossible, the most impossible one is left out.
+
+    Args:
+      belief: before.
+      at: the pose at which the sightings are linearised.
+      sightings: `S` of them.
+      most: the gate, a quantile of chi-square with 2 degrees of freedom.
+
+    Returns:
+      The belief, as of `update`; the sightings, those left out not valid; and the NIS of those that are left.
+    """
+
+    def left_out(carry: tuple[Sightings, Belief, Array, Array]) -> tuple[Sightings, Belief, Array, Array]:
+        sightings = carry[0]
+        after, nis, nis_of_each = update(belief, at, sightings)
+        worst = jnp.max(nis_of_each)
+        bad = worst >= most
+        return _only(sightings, ~bad | (nis_of_each < worst)), after, nis, bad
+
+    carry = (sightings, belief, jnp.zeros((), belief.mean.dtype), jnp.asarray(True))
+    sightings, after, nis, _ = jax.lax.while_loop(lambda carry: carry[3], left_out, carry)
+    return after, sightings, nis
+
+
+def update(
+    belief: Belief, at: Float[Array, "3"], sightings: Sightings
+) -> tuple[Belief, Float[Array, ""], Float[Array, " S"]]:
     """The belief after all sightings of a scan together, and their normalised innovation squared.
 
     With T = cov(y - H own), the gain of the own part is that of a Kalman filter, C+ H' T^-1 with
@@ -744,7 +777,8 @@ def update(belief: Belief, at: Float[Array, "3"], sightings: Sightings) -> tuple
       sightings: what the scan has seen from there.
 
     Returns:
-      The belief, with a covariance that is a sum of squares; and the NIS, of 2 degrees of freedom for each sighting.
+      The belief, with a covariance that is a sum of squares; the NIS, of 2 degrees of freedom for each sighting; and
+      for each sighting alone the NIS of what it is found to be, by the belief and all the others. Shape `[S]`.
     """
     n, dtype = sightings.valid.shape[0], belief.mean.dtype
     by_map, cov = sightings.by_map, sightings.cov
@@ -768,6 +802,12 @@ def update(belief: Belief, at: Float[Array, "3"], sightings: Sightings) -> tuple
     gain = own @ h_white.T
     gain = (gain + common_white.T - common_white.T @ h_white @ gain) @ white
     nis = jnp.sum(y_white**2) - quadratic(h_white.T @ y_white, own)
+    # S^-1 = W' (1 - H_w C+ H_w') W, by blocks. What the others leave open of one is the inverse of its own block of it.
+    residual = y_white - h_white @ (own @ (h_white.T @ y_white))
+    unlikely = (white.T @ residual).reshape(n, 2)
+    blocks, through = white.reshape(2 * n, n, 2), (h_white.T @ white).reshape(3, n, 2)
+    information = jnp.einsum("kia,kib->iab", blocks, blocks) - jnp.einsum("cia,cd,dib->iab", through, own, through)
+    nis_of_each = quadratic(unlikely, inverse(information))
 
     left = jnp.eye(3, dtype=dtype) - gain @ h
     of_each = gain.reshape(3, n, 2)
@@ -779,7 +819,7 @@ def update(belief: Belief, at: Float[Array, "3"], sightings: Sightings) -> tuple
         cov_own=propagate(left, belief.cov_own) + symmetric(jnp.einsum("cna,nab,dnb->cd", of_each, cov, of_each)),
         by_map=carried.at[:, sightings.slot].add(-added),
     )
-    return after, nis
+    return after, nis, nis_of_each
 
 
 def _inverse_root(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
@@ -894,6 +934,12 @@ def _where(
     these = Sightings(slot=slot, innovation=innovation, jac_pose=jac_pose, by_map=by_map, cov=cov, valid=valid)
     chosen = choose(valid, these, nothing)
     return dataclasses.replace(chosen, slot=chosen.slot.astype(jnp.int32))
+
+
+def _only(sightings: Sightings, which: Bool[Array, " S"]) -> Sightings:
+    """These sightings, the others not valid."""
+    fields = {field.name: getattr(sightings, field.name) for field in dataclasses.fields(sightings)}
+    return _where(fields.pop("valid") & which, **fields)
 
 
 def _no_sightings(count: int, dtype: Any) -> Sightings:
