@@ -251,6 +251,26 @@ def test_maps_are_merged(built: Path, run: Any, tmp_path: Path) -> None:
     assert "only 0.0 m agree: are both in one frame" in err
 
 
+def test_what_is_in_another_frame_has_not_moved(built: Path, run: Any, tmp_path: Path) -> None:
+    """Of maps that do not agree it is told that they do not; no change is."""
+    beside = document(built / "a/map.json")
+    for line in beside["lines"]:
+        for point in (line["anchor"], line["begin"], line["end"]):
+            point[0] += 0.3
+            point[1] -= 0.3
+    (tmp_path / "beside.json").write_text(json.dumps(beside))
+    maps = built / "a/map.json", tmp_path / "beside.json"
+    status, out, err = run("merge", *maps, "-o", tmp_path / "both")
+    assert status == 0
+    assert "are both in one frame" in err
+    assert "--later" not in err
+    status, out, err = run("compare", *maps)
+    assert status == 0
+    assert "are both in one frame" in err
+    assert [line.split(":")[0] for line in out.splitlines()[1:]] == ["moved", "vanished", "appeared"]
+    assert int(out.splitlines()[1].split()[1]) >= 2
+
+
 def test_maps_are_compared(built: Path, run: Any) -> None:
     maps = built / "a/map.json", built / "b/map.json"
     status, out, err = run("compare", *maps, "--json", "--log-b", built / "b.log")

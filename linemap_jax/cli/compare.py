@@ -10,7 +10,7 @@ import tyro
 
 from linemap_jax.cli.fit import Fit, at_poses_of_map
 from linemap_jax.cli.logs import mount_of, opened, plain_chunks, progress, warn
-from linemap_jax.cli.merge import AT_LEAST, read_two_maps, warn_of_frames
+from linemap_jax.cli.merge import AT_LEAST, in_one_frame, read_two_maps, warn_of_frames
 from linemap_jax.cli.options import LogInput, UsageError, check_input, own_options_first
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ ASK: "dict[What, str]" = {
 WENT_THROUGH = {"line": 1, "circle": 9}
 """So many times as many beams as ended there: past the corner of a wall, beams go through a circle that is there."""
 MOST_TOLD = 15
-"""Changes of a kind that are told in words; --json tells all."""
+"""Changes of a kind that are told in words, but none of maps that will not be in one frame; --json tells all."""
 
 
 @own_options_first
@@ -99,7 +99,8 @@ class Compare(LogInput):
                 found = found._replace(changes=changes)
                 warn(log, quiet=self.quiet)
                 fit.warn(log, map_file, quiet=self.quiet)
-        print(json.dumps(_summary(self, found, alike), indent=2) if self.json else _in_words(found))
+        most = MOST_TOLD if in_one_frame(alike) else 0
+        print(json.dumps(_summary(self, found, alike), indent=2) if self.json else _in_words(found, most))
         return 0
 
 
@@ -126,17 +127,17 @@ def _entry(change: "Change") -> dict[str, Any]:
     return {named.get(name, name): value for name, value in fields.items()}
 
 
-def _in_words(found: "Comparison") -> str:
+def _in_words(found: "Comparison", most: int = MOST_TOLD) -> str:
     said = [f"{found.same_lines} lines and {found.same_circles} circles are where they were"]
     for what in ("moved", "vanished", "appeared"):
         changes = [change for change in found.changes if change.what == what]
         sure = [change for change in changes if _borne_out(change)]
         lines = sum(change.kind == "line" for change in sure)
         said.append(f"{what}: {lines} lines or pieces of lines, {len(sure) - lines} circles")
-        said += [f"  {_told(change)}" for change in sure[:MOST_TOLD]]
-        if len(sure) > MOST_TOLD:
-            said.append(f"  ... and {len(sure) - MOST_TOLD} more")
-        if what in ASK and any(change.passed is None for change in changes):
+        said += [f"  {_told(change)}" for change in sure[:most]]
+        if 0 < most < len(sure):
+            said.append(f"  ... and {len(sure) - most} more")
+        if most and what in ASK and any(change.passed is None for change in changes):
             said.append(f"  {ASK[what]}")
         if len(changes) > len(sure):
             why = "but the other drive did not see through, or its own did"

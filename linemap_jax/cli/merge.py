@@ -57,9 +57,10 @@ class Merge:
         changes = compare_maps(a, b, at_least=AT_LEAST).changes
         merged, report = merge_maps(without_moved(a, b, changes) if self.later else a, b, pose_error=self.pose_error)
         joined = {name: int(getattr(report, name)) for name in ("lines_joined", "circles_joined", "circles_left_out")}
-        warn_of_frames(self.a, self.b, agreement(a, b), quiet=self.quiet)
+        alike = agreement(a, b)
+        warn_of_frames(self.a, self.b, alike, quiet=self.quiet)
         moved = [change.kind for change in changes if change.what == "moved"]
-        if moved and not self.later:
+        if moved and not self.later and in_one_frame(alike):
             say(
                 f"warning: {moved.count('line')} lines and {moved.count('circle')} circles have moved from {self.a} to "
                 f"{self.b}, and the map mixes both places (--later takes them from the second one; `linemap compare` "
@@ -100,9 +101,14 @@ def read_two_maps(a: Path, b: Path) -> tuple["LineMap", "LineMap", list[dict[str
     return one[0], other[0], [one[1], other[1]]
 
 
+def in_one_frame(found: "Agreement") -> bool:
+    """Whether two maps agree enough where they overlap, so that they will be in one frame."""
+    return found.agreeing > LEAST_AGREEING * found.overlap
+
+
 def warn_of_frames(a: Path, b: Path, found: "Agreement", *, quiet: bool) -> None:
-    """Say so, if two maps agree so little that they will not be in one frame."""
-    if found.agreeing <= LEAST_AGREEING * found.overlap:
+    """Say so, if two maps will not be."""
+    if not in_one_frame(found):
         say(
             f"warning: of {found.overlap:.1f} m of lines where {a} and {b} overlap only {found.agreeing:.1f} m agree: "
             "are both in one frame (`linemap localize` finds a drive in the map of another)?",

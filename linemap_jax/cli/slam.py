@@ -266,7 +266,7 @@ def _summary(
 
 def _in_words(summary: dict[str, Any]) -> str:
     pace = summary["us_per_scan"]
-    then = f"then {pace:.0f} us a scan with what else is compiled, " if pace else ""
+    then = f"then {pace / 1000:.1f} ms a scan on the whole, " if pace else ""
     then += f"{summary['times_real_time']:.0f} times as fast as recorded" if pace else ""
     return (
         f"{summary['scans']} scans over {summary['driven_m']:.0f} m -> {summary['keyframes']} keyframes, "
