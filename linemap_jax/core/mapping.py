@@ -267,7 +267,7 @@ def _update_lines(
     slot = jnp.where(targets < 0, LEFT_OUT, slot)
     merged = jnp.zeros((), jnp.int32)
     if rules.merge:
-        seen_apart = _mark(~pair.collinear, targets, model.valid.shape[0])
+        seen_apart = _at_slots(~pair.collinear, targets, model.valid.shape[0])
         touched = jnp.where(first, targets, -1)
         model, moved, merged = merge_lines(model, fused, touched, seen_apart, thresholds, rules, pose_error)
         targets = jnp.where(targets >= 0, moved[targets], targets)
@@ -326,7 +326,7 @@ def _marked(slots: Int[Array, " L"], capacity: int) -> Bool[Array, " K"]:
     return jnp.zeros(capacity, bool).at[jnp.where(slots < 0, capacity, slots)].set(True, mode="drop")
 
 
-def _mark(which: Bool[Array, "L L"], slots: Int[Array, " L"], capacity: int) -> Bool[Array, "L K"]:
+def _at_slots(which: Bool[Array, "L L"], slots: Int[Array, " L"], capacity: int) -> Bool[Array, "L K"]:
     """The columns brought to the slots of the map that they stand for, -1 for none."""
     into = jnp.where(slots < 0, capacity, slots)
     return jnp.zeros((which.shape[0], capacity), bool).at[:, into].max(which, mode="drop")
