@@ -21,7 +21,7 @@ Seen again, a line tells how the pose has moved since, and hardly more of where 
 different primitives are taken for independent. An error that all have in common moves the whole map, and the robot's
 place in it not at all.
 
-What the rest of a scan contradicts is left out of it (`update_with_consistent`): things move, and maps stay as they are.
+What the rest of a scan contradicts is left out of it (`update_with_consistent`): things move, and a map stays as it is.
 A scan that the map does not explain is not used; several of them, and the filter says that it is lost.
 """
 
