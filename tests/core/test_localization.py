@@ -137,7 +137,7 @@ def test_what_has_moved_pulls_no_pose_away(unsure: tuple[float, float], dtype: A
         fit=jnp.asarray(0.9, dtype),
         lost=jnp.asarray(False),
     )
-    gate = LocalizationSettings().match_nis
+    gate = LocalizationSettings().consistent_nis
     pulled = UPDATE(before, before.mean, walls)[0]
     assert float(jnp.max(jnp.abs(pulled.mean))) > 0.01
     after, left, nis = jax.jit(update_with_consistent)(before, before.mean, walls, gate)

@@ -81,6 +81,9 @@ class LocalizationSettings:
 
     match_nis: Number = 9.21
     """Largest normalised innovation squared of what is used: 99 % of chi-square with 2 degrees of freedom."""
+    consistent_nis: Number = 16.95
+    """Largest that a sighting may have, given all others: chi-square with 2 degrees of freedom again, at 1 % for all
+    `SIGHTINGS` together. Walls are not straight, and what is asked of the worst has to be asked more mildly."""
     point_distance: Number = 0.1
     """Farthest a point in no line may lie from a segment of the map to count as seen of it, m."""
     offset_floor: Number = 0.01
@@ -432,7 +435,7 @@ def locate(
         sightings = gated(judged_by, at, _packed([by_lines, by_circles, by_points]), settings.match_nis)
         # Nor may a thing pull the pose away from where it can be: a pole that was moved fits, once it has.
         sightings = gated(prior, at, sightings, settings.match_nis)
-        after, sightings, nis = update_with_consistent(prior, at, sightings, settings.match_nis)
+        after, sightings, nis = update_with_consistent(prior, at, sightings, settings.consistent_nis)
         return after.mean, after, sightings, nis
 
     def points_from(at: Float[Array, "3"]) -> Sightings:
