@@ -26,7 +26,6 @@ NAMES = (
     *("gap_distance", "gap_spacings", "gap_sigmas", "gap_beams", "line_distance", "line_sigmas"),
     *("circle_line_distance", "match_angle", "match_distance", "match_sigmas", "match_nis", "match_gap"),
     *("circle_match_distance", "circle_match_nis", "end_sigmas", "wipe_extension", "wipe_sigmas"),
-    "contradictions",
 )
 
 
