@@ -13,7 +13,7 @@ import tyro
 from linemap_jax.cli.history import History
 from linemap_jax.cli.logs import SCANS_EXPLAINED, chunks_of_log, mount_of, opened, progress, tell_poses, warn
 from linemap_jax.cli.mapping import map_of_pieces
-from linemap_jax.cli.noise import noise_of_map, states_noise
+from linemap_jax.cli.noise import noise_of_map, states_noise, tell_noise
 from linemap_jax.cli.options import LogOptions, options_of_update, own_options_first
 from linemap_jax.cli.output import check_output, make_folder, say
 from linemap_jax.cli.rejections import Rejections
@@ -118,7 +118,9 @@ class Build(LogOptions):
             print(f"linemap: interrupted; the map so far is in {self.output}", file=sys.stderr)
             return 130
         files = {"map": str(map_file), "picture": str(picture)} | ({"page": str(page)} if self.html else {})
-        summary = _summary(self, line_map, report, options, seconds) | {"poses": tell_poses(self, log)} | files
+        stated = states_noise(self) or (before is not None and noise_of_map(before.settings) is not None)
+        told = {"poses": tell_poses(self, log), "noise": tell_noise(options["noise"], stated=stated)}
+        summary = _summary(self, line_map, report, options, seconds) | told | files
         print(json.dumps(summary, indent=2) if self.json else _in_words(summary))
         share = float(summary["explained"])
         if summary["lines"] and share < FEW_EXPLAINED:
@@ -223,6 +225,7 @@ def _in_words(summary: dict[str, Any]) -> str:
         f"median line {summary['median_line_length_m']:.2f} m, {summary['duplicates']} duplicate lines\n"
         f"{summary['seconds_to_first_chunk']:.1f} s to compile, {then}\n"
         f"poses:   {summary['poses']}\n"
+        f"noise:   {summary['noise']}\n"
         f"map:     {summary['map']}\n"
         f"picture: {summary['picture']}" + (f"\npage:    {summary['page']}" if "page" in summary else "")
     )

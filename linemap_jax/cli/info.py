@@ -130,5 +130,6 @@ def _scanner_in_words(told: dict[str, Any]) -> list[str]:
     if "refused" in told:
         said.append(f"`linemap build` would refuse it: it {told['refused']}")
     elif "next" in told:
+        said.append("noise:    of the scanner: `linemap calibrate` tells it from the log, if you do not know it")
         said.append(f"next:     {told['next']}{WHY[told['drift']]}")
     return said

@@ -33,5 +33,11 @@ def noise_of_map(settings: Mapping[str, Any]) -> "SensorNoise | None":
     return SensorNoise(**{name: float(noise[name]) for name in names})
 
 
+def tell_noise(noise: "SensorNoise", *, stated: bool) -> str:
+    """The noise that a command has taken, in words; and where to learn another, if nobody has stated it."""
+    whose = "" if stated else "; nobody has stated it: `linemap calibrate` tells that of the log"
+    return f"{noise.range_sigma:.3g} m of ranges, {noise.bearing_sigma:.2g} rad of bearings{whose}"
+
+
 def _is_sigma(value: Any) -> bool:
     return isinstance(value, int | float) and 0 <= value < math.inf

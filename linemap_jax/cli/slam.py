@@ -13,6 +13,7 @@ import tyro
 
 from linemap_jax.cli.logs import SCANS_EXPLAINED, chunks_of_log, mount_of_odometry, odometry_of, opened, progress, warn
 from linemap_jax.cli.mapping import map_of_pieces
+from linemap_jax.cli.noise import states_noise, tell_noise
 from linemap_jax.cli.options import POSE_SIGMA, LogOptions, UsageError, options_of_update, own_options_first
 from linemap_jax.cli.output import check_output, make_folder, say
 
@@ -103,7 +104,8 @@ class Slam(LogOptions):
             print(f"linemap: interrupted; map and trajectory so far are in {self.output}", file=sys.stderr)
             return 130
         pace = _pace(stamps, seconds, to_first + mapped.seconds[0][0])
-        summary = _summary(self, slammed, line_map, trajectory, drift, files) | pace
+        noise = {"noise": tell_noise(options["noise"], stated=states_noise(self))}
+        summary = _summary(self, slammed, line_map, trajectory, drift, files) | noise | pace
         print(json.dumps(summary, indent=2) if self.json else _in_words(summary))
         return 0
 
@@ -276,6 +278,7 @@ def _in_words(summary: dict[str, Any]) -> str:
         f"variance of unit weight of the adjustment: {summary['unit_variance']:.2f}"
         f"{', by which the covariances are widened' if summary['unit_variance'] > 1 else ''}\n"
         f"{summary['seconds_to_first_chunk']:.1f} s to compile, {then or 'too few scans to time'}\n"
+        f"noise:       {summary['noise']}\n"
         f"map:         {summary['map']}\n"
         f"picture:     {summary['picture']}\n"
         f"trajectory:  {summary['trajectory']}\n"
